@@ -1,0 +1,107 @@
+//! A received message, and the envelope around every header.
+
+use iceoryx2::prelude::ZeroCopySend;
+
+use super::Ipc;
+use crate::Payload;
+use crate::channel::Channel;
+use crate::payload;
+
+payload! {
+    /// What every message says of itself.
+    pub struct Envelope {
+        /// Mission time of what it describes.
+        pub stamp_ns: u64,
+        /// Mission time when it was sent; 0 from commands outside the mission's clock.
+        pub sent_ns: u64,
+        /// Counts the messages of its sender on this channel.
+        pub sequence: u64,
+        /// Which life of the sender sent it.
+        pub incarnation: u64,
+        /// Of requests and replies: the request's id.
+        pub request_id: u64,
+        /// Of requests and replies: which life of the client asked (ids of short-lived commands may repeat).
+        pub client_incarnation: u64,
+        /// [`crate::ServiceName`] code of the sender.
+        pub sender: u32,
+        /// Of requests and replies: [`crate::ServiceName`] code of the client.
+        pub client: u32,
+    }
+}
+
+/// Envelope and header, as they lie in shared memory.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Framed<H> {
+    pub(crate) envelope: Envelope,
+    pub(crate) header: H,
+}
+
+#[expect(unsafe_code, reason = "shared memory needs the promise that the type holds no pointer")]
+// SAFETY: `repr(C)` of two types that are `Pod`: no pointers, no drop glue.
+unsafe impl<H: Payload> ZeroCopySend for Framed<H> {}
+
+type RawSample<C> = iceoryx2::sample::Sample<Ipc, [<C as Channel>::Item], Framed<<C as Channel>::Header>>;
+
+/// A message, read where it lies. Dropping it gives its chunk back to the sender: do not keep more than a few.
+pub struct Message<C: Channel>(RawSample<C>);
+
+impl<C: Channel> core::fmt::Debug for Message<C> {
+    fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
+        f.debug_struct("Message").field("channel", &C::NAME).field("envelope", self.envelope()).finish_non_exhaustive()
+    }
+}
+
+impl<C: Channel> Message<C> {
+    pub(super) fn new(raw: RawSample<C>) -> Self {
+        Self(raw)
+    }
+
+    /// What the message says of itself.
+    #[must_use]
+    pub fn envelope(&self) -> &Envelope {
+        &self.0.user_header().envelope
+    }
+
+    /// The part of fixed size.
+    #[must_use]
+    pub fn header(&self) -> &C::Header {
+        &self.0.user_header().header
+    }
+
+    /// The slice, in shared memory.
+    #[must_use]
+    pub fn items(&self) -> &[C::Item] {
+        self.0.payload()
+    }
+
+    /// Mission time of what it describes.
+    #[must_use]
+    pub fn stamp_ns(&self) -> u64 {
+        self.envelope().stamp_ns
+    }
+
+    /// Mission time when it was sent.
+    #[must_use]
+    pub fn sent_ns(&self) -> u64 {
+        self.envelope().sent_ns
+    }
+
+    /// Of requests and replies: the request's id.
+    #[must_use]
+    pub fn request_id(&self) -> u64 {
+        self.envelope().request_id
+    }
+
+    /// Of requests: where the reply goes.
+    #[must_use]
+    pub fn address(&self) -> super::ReplyAddress {
+        let envelope = self.envelope();
+        super::ReplyAddress {
+            client: envelope.client,
+            client_incarnation: envelope.client_incarnation,
+            request_id: envelope.request_id,
+            sent_ns: envelope.sent_ns,
+        }
+    }
+}

@@ -1,0 +1,169 @@
+//! The wrapper over a real domain of its own.
+
+use std::rc::Rc;
+
+use super::*;
+use crate::channel::{
+    AliveChannel, FrameChannel, MissionStateChannel, RoundChannel, SnapshotChannel, VehicleTargetChannel,
+};
+use crate::messages::{Alive, FrameHeader, MissionState, RoundReply, RoundRequest, SnapshotHeader, VehicleTarget};
+
+struct Domain {
+    system: System,
+    _base: tempfile::TempDir,
+}
+
+impl Domain {
+    fn new() -> Self {
+        let base = tempfile::tempdir_in("/dev/shm").expect("tmpfs");
+        Self { system: System::create(base.path(), "t", 0).expect("system"), _base: base }
+    }
+
+    fn join(&self, name: ServiceName, by_tick: bool) -> Bus {
+        let limits = Limits { image_bytes: 64 * 48 * 5, small_depth_bytes: 16 * 12 * 2, gaussians: 100 };
+        Bus::open(&self.system, limits, name, 7, by_tick).expect("joined")
+    }
+}
+
+impl Drop for Domain {
+    fn drop(&mut self) {
+        drop(self.system.remove());
+    }
+}
+
+#[test]
+fn what_is_sent_arrives_with_its_envelope() {
+    let domain = Domain::new();
+    let (planner, link) = (domain.join(ServiceName::Planner, false), domain.join(ServiceName::Px4Link, false));
+    let mut publisher = planner.publisher::<AliveChannel>().expect("publisher");
+    let mut subscriber = link.subscriber::<AliveChannel>().expect("subscriber");
+    publisher.send(30, 20, &Alive { sequence: 9 }).expect("sent");
+    let message = subscriber.receive(30).expect("received").expect("a message");
+    assert_eq!((message.header().sequence, message.stamp_ns(), message.sent_ns()), (9, 20, 30));
+    assert_eq!(message.envelope().sender, ServiceName::Planner.code());
+    assert!(subscriber.receive(30).expect("received").is_none());
+}
+
+#[test]
+fn a_member_sees_only_what_was_sent_before_its_tick_in_order() {
+    let domain = Domain::new();
+    let (a, b) = (domain.join(ServiceName::Trainer, true), domain.join(ServiceName::Camera, true));
+    let (mut late, mut early) = (a.publisher::<AliveChannel>().expect("a"), b.publisher::<AliveChannel>().expect("b"));
+    let mut reader = domain.join(ServiceName::Planner, true).subscriber::<AliveChannel>().expect("reader");
+    assert!(reader.receive(10).expect("connected").is_none());
+    late.send(20, 20, &Alive { sequence: 3 }).expect("sent");
+    late.send(20, 20, &Alive { sequence: 4 }).expect("sent");
+    early.send(10, 10, &Alive { sequence: 1 }).expect("sent");
+    early.send(20, 20, &Alive { sequence: 2 }).expect("sent");
+    assert!(reader.receive(10).expect("received").is_none(), "sent at 10 is not before 10");
+    let mut seen = |now| {
+        let mut all = Vec::new();
+        while let Some(message) = reader.receive(now).expect("received") {
+            all.push(message.header().sequence);
+        }
+        all
+    };
+    assert_eq!(seen(20), [1]);
+    // Camera's code is below trainer's: the order does not depend on who was faster.
+    assert_eq!(seen(30), [2, 3, 4]);
+}
+
+#[test]
+fn a_late_joiner_gets_the_state_but_never_a_path() {
+    let domain = Domain::new();
+    let bus = domain.join(ServiceName::Planner, false);
+    let mut state = bus.publisher::<MissionStateChannel>().expect("state");
+    let mut target = bus.publisher::<VehicleTargetChannel>().expect("target");
+    state.send(1, 1, &MissionState { round: 5, ..MissionState::default() }).expect("sent");
+    target.send(1, 1, &VehicleTarget { id: 5, ..VehicleTarget::default() }).expect("sent");
+    let late = domain.join(ServiceName::Command, false);
+    let mut states = late.subscriber::<MissionStateChannel>().expect("states");
+    let mut targets = late.subscriber::<VehicleTargetChannel>().expect("targets");
+    bus.serve_late_joiners();
+    assert_eq!(states.latest(2).expect("received").expect("history").header().round, 5);
+    assert!(targets.latest(2).expect("received").is_none());
+}
+
+#[test]
+fn a_frame_is_filled_in_place_and_a_wild_size_is_refused() {
+    let domain = Domain::new();
+    let bus = domain.join(ServiceName::Camera, false);
+    let mut frames = bus.publisher::<FrameChannel>().expect("frames");
+    let mut reader = domain.join(ServiceName::Command, false).subscriber::<FrameChannel>().expect("reader");
+    let header = FrameHeader { width: 64, height: 48, has_color: 1, ..FrameHeader::default() };
+    let len = header.items_len();
+    frames.send_with(1, 1, &header, len, |bytes| bytes[len - 1] = 77).expect("sent");
+    let frame = reader.latest(2).expect("received").expect("a frame");
+    assert_eq!((frame.items().len(), frame.items()[len - 1], frame.items()[0]), (len, 77, 0));
+    let error = frames.send_with(1, 1, &header, len * 2, |_| ()).expect_err("too large");
+    assert!(matches!(error, BusError::TooManyItems { .. }), "{error}");
+}
+
+#[test]
+fn without_a_free_chunk_a_snapshot_is_refused_and_later_ones_go_through() {
+    let domain = Domain::new();
+    let mut snapshots = domain.join(ServiceName::Trainer, false).publisher::<SnapshotChannel>().expect("snapshots");
+    let mut readers: Vec<_> = (0..4)
+        .map(|_| domain.join(ServiceName::Command, false).subscriber::<SnapshotChannel>().expect("reader"))
+        .collect();
+    for reader in &mut readers {
+        assert!(reader.receive(0).expect("connected").is_none());
+    }
+    let mut held = Vec::new();
+    let mut refused = false;
+    for generation in 0..12 {
+        let header = SnapshotHeader { generation, ..SnapshotHeader::default() };
+        match snapshots.send_with(1, 1, &header, 3, |_| ()) {
+            Ok(()) => {
+                // Each reader keeps three snapshots of its own: they cannot all have a chunk.
+                for reader in readers.iter_mut().skip(generation as usize / 3).take(1) {
+                    held.extend(reader.receive(2).expect("received"));
+                }
+            }
+            Err(error) => {
+                assert!(matches!(error, BusError::NoChunk { .. }), "{error}");
+                refused = true;
+                held.clear();
+            }
+        }
+    }
+    assert!(refused, "six chunks cannot serve readers that keep everything");
+    snapshots.send_with(1, 1, &SnapshotHeader::default(), 3, |_| ()).expect("chunks came back");
+}
+
+#[test]
+fn a_request_survives_a_server_that_comes_late_and_gets_its_own_replies() {
+    let domain = Domain::new();
+    let mut client = domain.join(ServiceName::Planner, false).client::<RoundChannel>().expect("client");
+    let mut stranger = domain.join(ServiceName::Command, false).client::<RoundChannel>().expect("client");
+    client.send(10, 42, &RoundRequest { round: 3, ..RoundRequest::default() }, &[1, 2, 3]).expect("sent");
+    let mut server = domain.join(ServiceName::Trainer, false).server::<RoundChannel>().expect("server");
+    assert!(client.receive(20).expect("nothing yet").is_none());
+    std::thread::sleep(std::time::Duration::from_millis(600));
+    assert!(client.receive(20).expect("sent again").is_none());
+    let request = server.receive(30).expect("received").expect("sent again");
+    assert_eq!((request.header().round, request.items()), (3, &[1, 2, 3][..]));
+    assert_eq!(request.stamp_ns(), 10, "the first sending's time");
+    let to = request.address();
+    server.reply(30, &to, &RoundReply { iterations: 8, ..RoundReply::default() }, &[]).expect("replied");
+    assert!(stranger.receive(40).expect("received").is_none(), "not the stranger's");
+    let reply = client.receive(40).expect("received").expect("a reply");
+    assert_eq!((reply.request_id(), reply.header().iterations), (42, 8));
+    client.finish(42);
+    server.reply(50, &to, &RoundReply::default(), &[]).expect("replied");
+    assert!(client.receive(60).expect("received").is_none(), "finished requests get nothing");
+}
+
+#[test]
+fn waiting_ends_with_a_message_and_not_before() {
+    let domain = Domain::new();
+    let mut frames = domain.join(ServiceName::Camera, false).publisher::<FrameChannel>().expect("frames");
+    let listener = domain.join(ServiceName::Command, false).listener::<FrameChannel>().expect("listener");
+    let header = FrameHeader { width: 2, height: 2, ..FrameHeader::default() };
+    frames.send_with(1, 1, &header, header.items_len(), |_| ()).expect("sent");
+    let before = std::time::Instant::now();
+    wait(&[&listener], &[], std::time::Duration::from_secs(20)).expect("woken");
+    assert!(before.elapsed() < std::time::Duration::from_secs(10), "woken by the message");
+    wait(&[&listener], &[], std::time::Duration::from_millis(1)).expect("over");
+    assert_eq!(Rc::strong_count(&domain.join(ServiceName::Command, false).0), 1);
+}

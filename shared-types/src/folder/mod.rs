@@ -1,0 +1,223 @@
+//! The mission folder, which is the truth of a mission: where everything lies in it, and how it is written so that a
+//! reader finds each file complete or not at all, whatever dies in between.
+//!
+//! ```text
+//! mission.toml                  the resolved configuration
+//! journal.jsonl                 the planner's decisions, one line each
+//! keyframes/000017/             rgb.png, depth.png, frame.json
+//! prior/overhead, prior/side    the two views of the prior; the same three files
+//! model/                        checkpoints and models
+//! report/                       what was measured
+//! ```
+
+use std::path::{Path, PathBuf};
+
+pub mod files;
+pub mod keyframe;
+mod png_file;
+
+pub use files::{clean_leftovers, write_atomic, write_dir_atomic};
+pub use keyframe::{Exposure, Frame, Gate, Keyframe};
+
+use crate::messages::KeyframeReason;
+
+/// What can go wrong with a mission folder. Every variant names the file.
+#[derive(Debug, thiserror::Error)]
+pub enum FolderError {
+    /// The system refused.
+    #[error("cannot {action} {path}: {source}")]
+    Io {
+        /// What was tried.
+        action: &'static str,
+        /// On what.
+        path: PathBuf,
+        /// The system's reason.
+        source: std::io::Error,
+    },
+    /// No room for a file; nothing of it was left behind.
+    #[error("no room for {path} ({bytes} bytes): free disk space, or choose another folder with --output: {source}")]
+    Full {
+        /// The file that does not fit.
+        path: PathBuf,
+        /// Its size.
+        bytes: u64,
+        /// The system's reason.
+        source: std::io::Error,
+    },
+    /// A new mission was to be put where another lies.
+    #[error(
+        "{root} already holds a mission ({found} is there): go on with it by `vantage resume {root}`, \
+         or choose another folder with --output"
+    )]
+    HoldsMission {
+        /// The folder.
+        root: PathBuf,
+        /// What gives it away.
+        found: &'static str,
+    },
+    /// A folder that was to be opened holds no mission.
+    #[error(
+        "{root} holds no mission (neither mission.toml nor keyframes/): give the folder that `vantage fly` printed"
+    )]
+    NoMission {
+        /// The folder.
+        root: PathBuf,
+    },
+    /// What is to be written is there already, or an image is wanted that has no place in the folder.
+    #[error("{path} exists already and is never overwritten")]
+    Exists {
+        /// What is there.
+        path: PathBuf,
+    },
+    /// A file is cut, damaged, or does not fit the files beside it.
+    #[error(
+        "{path}: {field} is {found}, expected {expected}: the file is damaged; remove its folder and take the view again"
+    )]
+    Damaged {
+        /// The file.
+        path: PathBuf,
+        /// Which part of it.
+        field: String,
+        /// What is there.
+        found: String,
+        /// What should be.
+        expected: String,
+    },
+}
+
+/// A mission folder.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct MissionFolder {
+    root: PathBuf,
+}
+
+impl MissionFolder {
+    /// Makes the folder of a new mission, with its subfolders. The folder may exist, but not hold a mission.
+    ///
+    /// # Errors
+    /// [`FolderError::HoldsMission`] where one lies already; [`FolderError::Io`] where the folder cannot be made.
+    pub fn create(root: impl AsRef<Path>) -> Result<Self, FolderError> {
+        let folder = Self { root: absolute(root.as_ref())? };
+        for found in ["mission.toml", "journal.jsonl", "keyframes", "prior", "model"] {
+            if folder.root.join(found).exists() {
+                return Err(FolderError::HoldsMission { root: folder.root, found });
+            }
+        }
+        for sub in ["keyframes", "prior", "model", "report"] {
+            files::create_dir_durable(&folder.root.join(sub))?;
+        }
+        Ok(folder)
+    }
+
+    /// Opens the folder of a mission, and removes what dead writers left half-made in it.
+    ///
+    /// # Errors
+    /// [`FolderError::NoMission`] where none lies; [`FolderError::Io`].
+    pub fn open(root: impl AsRef<Path>) -> Result<Self, FolderError> {
+        let folder = Self { root: absolute(root.as_ref())? };
+        if !folder.config_path().is_file() && !folder.keyframes_path().is_dir() {
+            return Err(FolderError::NoMission { root: folder.root });
+        }
+        for sub in ["", "keyframes", "prior", "model", "report"] {
+            clean_leftovers(&folder.root.join(sub))?;
+        }
+        Ok(folder)
+    }
+
+    /// The folder itself, absolute.
+    #[must_use]
+    pub fn root(&self) -> &Path {
+        &self.root
+    }
+
+    /// `mission.toml`: the resolved configuration, versions, seed, declared costs.
+    #[must_use]
+    pub fn config_path(&self) -> PathBuf {
+        self.root.join("mission.toml")
+    }
+
+    /// `journal.jsonl`: the planner's decisions.
+    #[must_use]
+    pub fn journal_path(&self) -> PathBuf {
+        self.root.join("journal.jsonl")
+    }
+
+    /// `keyframes`: one folder a keyframe.
+    #[must_use]
+    pub fn keyframes_path(&self) -> PathBuf {
+        self.root.join("keyframes")
+    }
+
+    /// `keyframes/000017`.
+    #[must_use]
+    pub fn keyframe_path(&self, id: u64) -> PathBuf {
+        self.keyframes_path().join(format!("{id:06}"))
+    }
+
+    /// `prior`: the two views of the prior.
+    #[must_use]
+    pub fn prior_path(&self) -> PathBuf {
+        self.root.join("prior")
+    }
+
+    /// Where a view taken for a reason lies: prior views under `prior/`, keyframes under their number. `None` for a
+    /// frame of the stream, which is never stored.
+    #[must_use]
+    pub fn view_path(&self, reason: KeyframeReason, id: u64) -> Option<PathBuf> {
+        match reason {
+            KeyframeReason::Stream => None,
+            KeyframeReason::PriorOverhead => Some(self.prior_path().join("overhead")),
+            KeyframeReason::PriorSide => Some(self.prior_path().join("side")),
+            KeyframeReason::Seed | KeyframeReason::Selected => Some(self.keyframe_path(id)),
+        }
+    }
+
+    /// `model`: checkpoints, models of each round, the final model.
+    #[must_use]
+    pub fn model_path(&self) -> PathBuf {
+        self.root.join("model")
+    }
+
+    /// `report`: what was measured.
+    #[must_use]
+    pub fn report_path(&self) -> PathBuf {
+        self.root.join("report")
+    }
+}
+
+fn absolute(path: &Path) -> Result<PathBuf, FolderError> {
+    std::path::absolute(path).map_err(|source| FolderError::Io { action: "find", path: path.to_owned(), source })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_folder_takes_one_mission() {
+        let dir = tempfile::tempdir().expect("tempdir");
+        let root = dir.path().join("m");
+        assert!(matches!(MissionFolder::open(&root), Err(FolderError::NoMission { .. })));
+        let made = MissionFolder::create(&root).expect("new");
+        assert_eq!(MissionFolder::open(&root).expect("open"), made);
+        let message = MissionFolder::create(&root).expect_err("holds one").to_string();
+        assert!(message.contains("vantage resume") && message.contains(&root.display().to_string()), "{message}");
+    }
+
+    #[test]
+    fn an_existing_folder_without_a_mission_is_taken() {
+        let dir = tempfile::tempdir().expect("tempdir");
+        std::fs::write(dir.path().join("notes.txt"), "mine").expect("write");
+        MissionFolder::create(dir.path()).expect("no mission in it");
+        assert_eq!(std::fs::read(dir.path().join("notes.txt")).expect("kept"), b"mine");
+    }
+
+    #[test]
+    fn a_file_in_the_way_is_named() {
+        let dir = tempfile::tempdir().expect("tempdir");
+        let root = dir.path().join("file");
+        std::fs::write(&root, "x").expect("write");
+        let message = MissionFolder::create(&root).expect_err("a file").to_string();
+        assert!(message.contains("file"), "{message}");
+    }
+}

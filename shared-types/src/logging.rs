@@ -1,0 +1,56 @@
+//! Logs: `tracing` events, quiet by default, and iceoryx2's own messages brought into them.
+
+use iceoryx2_log::{Log, LogLevel};
+use tracing_subscriber::EnvFilter;
+use tracing_subscriber::filter::LevelFilter;
+use tracing_subscriber::layer::SubscriberExt as _;
+use tracing_subscriber::util::SubscriberInitExt as _;
+
+/// Sends iceoryx2's messages to `tracing`. Its informational chatter is below our debug level.
+struct Bridge;
+
+impl Log for Bridge {
+    fn log(&self, level: LogLevel, origin: core::fmt::Arguments<'_>, message: core::fmt::Arguments<'_>) {
+        match level {
+            LogLevel::Trace | LogLevel::Debug | LogLevel::Info => {
+                tracing::trace!(target: "iceoryx2", %origin, "{message}")
+            }
+            LogLevel::Warn => tracing::debug!(target: "iceoryx2", %origin, "{message}"),
+            LogLevel::Error | LogLevel::Fatal => tracing::warn!(target: "iceoryx2", %origin, "{message}"),
+        }
+    }
+}
+
+static BRIDGE: Bridge = Bridge;
+
+type Reload = Box<dyn Fn(LevelFilter) -> bool + Send + Sync>;
+static RELOAD: std::sync::OnceLock<Reload> = std::sync::OnceLock::new();
+
+/// Starts logging to standard error. `VANTAGE_LOG` takes `tracing-subscriber` filters, such as `debug` or
+/// `planner=trace`; the default is `info` for the services and `warn` for the commands.
+pub fn init(default: LevelFilter) {
+    let env = EnvFilter::builder().with_default_directive(default.into()).with_env_var("VANTAGE_LOG").from_env_lossy();
+    let (filter, handle) = tracing_subscriber::reload::Layer::new(env);
+    let output = tracing_subscriber::fmt::layer().with_writer(std::io::stderr).with_target(true).with_ansi(false);
+    if tracing_subscriber::registry().with(filter).with(output).try_init().is_ok() {
+        let reload: Reload =
+            Box::new(move |level| handle.reload(EnvFilter::default().add_directive(level.into())).is_ok());
+        // A second initialisation cannot get here: try_init succeeds once.
+        drop(RELOAD.set(reload));
+    }
+    iceoryx2_log::set_logger(&BRIDGE);
+    iceoryx2_log::set_log_level(LogLevel::Warn);
+}
+
+/// Changes the level of this process while it runs; 0 is error, 4 is trace. False when logging was not started here.
+#[must_use]
+pub fn set_level(level: u32) -> bool {
+    let filter = match level {
+        0 => LevelFilter::ERROR,
+        1 => LevelFilter::WARN,
+        2 => LevelFilter::INFO,
+        3 => LevelFilter::DEBUG,
+        _ => LevelFilter::TRACE,
+    };
+    RELOAD.get().is_some_and(|reload| reload(filter))
+}

@@ -1,0 +1,236 @@
+//! A system: one vehicle and its services, in one iceoryx2 domain of its own.
+//!
+//! Every run makes a fresh system, so that runs and tests live side by side and a domain that was wedged by a kill never
+//! outlives its run. Its folder lies on tmpfs: opening a channel there is faster, and the instant in which a kill leaves
+//! half-made files is shorter.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use serde::{Deserialize, Serialize};
+
+/// Where iceoryx2 keeps shared memory.
+pub const SHARED_MEMORY_DIR: &str = "/dev/shm";
+
+/// The root path and names must fit a unix socket's path (107 bytes), of which iceoryx2 needs about 42.
+const LONGEST_ROOT: usize = 64;
+
+/// What went wrong with a system's folder.
+#[derive(Debug, thiserror::Error)]
+pub enum SystemError {
+    /// A file or folder could not be handled.
+    #[error("{}: cannot {action}; expected a folder on tmpfs that this user may write (see `vantage doctor`)", path.display())]
+    Io {
+        /// The file.
+        path: PathBuf,
+        /// What was tried.
+        action: &'static str,
+        /// The operating system's word.
+        #[source]
+        source: std::io::Error,
+    },
+    /// `system.json` is not one.
+    #[error("{}: not a system description; remove the folder, its run is over", path.display())]
+    Malformed {
+        /// The file.
+        path: PathBuf,
+        /// The parser's word.
+        #[source]
+        source: serde_json::Error,
+    },
+    /// The folder's path is too long for sockets.
+    #[error("{}: {length} bytes, expected at most {LONGEST_ROOT} (unix sockets lie inside); set XDG_RUNTIME_DIR to a shorter folder", path.display())]
+    PathTooLong {
+        /// The folder.
+        path: PathBuf,
+        /// Its length.
+        length: usize,
+    },
+    /// No system, or more than one, where one was expected.
+    #[error("{found} systems in {}: {names}; expected one: name it with --system", base.display())]
+    NotOne {
+        /// Where was looked.
+        base: PathBuf,
+        /// How many there are.
+        found: usize,
+        /// Their names.
+        names: String,
+    },
+}
+
+/// A system and where its parts lie. Stored as `system.json` in its folder.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct System {
+    /// Name, unique among the systems of this user.
+    pub name: String,
+    /// Folder on tmpfs: `system.json`, the resolved configuration, px4-link's last return path, iceoryx2's files.
+    pub runtime_dir: PathBuf,
+    /// What every name in shared memory begins with.
+    pub prefix: String,
+    /// Process that made it and supervises it; 0 for none.
+    pub supervisor_pid: u32,
+    /// Version of the binary.
+    pub version: String,
+}
+
+impl System {
+    /// The folder that holds all systems: `/run/vantage` under systemd, else `$XDG_RUNTIME_DIR/vantage`, else in shared
+    /// memory.
+    #[must_use]
+    pub fn base_dir() -> PathBuf {
+        if std::env::var_os("RUNTIME_DIRECTORY").is_some() {
+            return PathBuf::from("/run/vantage");
+        }
+        match std::env::var_os("XDG_RUNTIME_DIR").map(PathBuf::from) {
+            Some(dir) if dir.is_dir() => dir.join("vantage"),
+            _ => PathBuf::from(format!("{SHARED_MEMORY_DIR}/vantage-{}", rustix::process::getuid().as_raw())),
+        }
+    }
+
+    /// Makes a fresh system below `base`.
+    ///
+    /// # Errors
+    /// When the folder cannot be made or its path is too long.
+    pub fn create(base: &Path, name: &str, supervisor_pid: u32) -> Result<Self, SystemError> {
+        let runtime_dir = base.join(name);
+        let length = runtime_dir.as_os_str().len();
+        if length > LONGEST_ROOT {
+            return Err(SystemError::PathTooLong { path: runtime_dir, length });
+        }
+        let now = rustix::time::clock_gettime(rustix::time::ClockId::Monotonic);
+        let unique =
+            (now.tv_sec.unsigned_abs() << 20) ^ now.tv_nsec.unsigned_abs() ^ (u64::from(std::process::id()) << 40);
+        let system = Self {
+            name: name.to_owned(),
+            prefix: format!("v{:08x}_", crate::payload::fold(crate::payload::SCHEMA_SEED, unique) >> 32),
+            runtime_dir,
+            supervisor_pid,
+            version: env!("CARGO_PKG_VERSION").to_owned(),
+        };
+        io(&system.runtime_dir, "make", fs::create_dir_all(&system.runtime_dir))?;
+        let config = format!(
+            "[global]\nroot-path = '{}'\nprefix = '{}'\n",
+            system.runtime_dir.join("bus").display(),
+            system.prefix
+        );
+        let config_path = system.bus_config_path();
+        io(&config_path, "write", fs::write(&config_path, config))?;
+        let description = system.runtime_dir.join("system.json");
+        let text = serde_json::to_string_pretty(&system)
+            .map_err(|source| SystemError::Malformed { path: description.clone(), source })?;
+        // Written aside and renamed: tools that list systems never read half of it.
+        let aside = system.runtime_dir.join("system.json.new");
+        io(&aside, "write", fs::write(&aside, text))?;
+        io(&description, "rename", fs::rename(&aside, &description))?;
+        Ok(system)
+    }
+
+    /// Opens a system by its folder.
+    ///
+    /// # Errors
+    /// When there is no readable `system.json`.
+    pub fn open(runtime_dir: &Path) -> Result<Self, SystemError> {
+        let path = runtime_dir.join("system.json");
+        let text = io(&path, "read", fs::read_to_string(&path))?;
+        serde_json::from_str(&text).map_err(|source| SystemError::Malformed { path, source })
+    }
+
+    /// Opens the system of a name (or folder), or the only one there is.
+    ///
+    /// # Errors
+    /// When there is none, or several and none was named.
+    pub fn find(base: &Path, name: Option<&str>) -> Result<Self, SystemError> {
+        match name {
+            Some(name) if name.contains('/') => Self::open(Path::new(name)),
+            Some(name) => Self::open(&base.join(name)),
+            None => {
+                let mut systems = Self::list(base);
+                match (systems.len(), systems.pop()) {
+                    (1, Some(system)) => Ok(system),
+                    (found, last) => {
+                        let names = systems.iter().chain(&last).map(|s| s.name.as_str()).collect::<Vec<_>>().join(", ");
+                        Err(SystemError::NotOne { base: base.to_owned(), found, names })
+                    }
+                }
+            }
+        }
+    }
+
+    /// Every system below `base`, by name; what cannot be read is left out.
+    #[must_use]
+    pub fn list(base: &Path) -> Vec<Self> {
+        let mut systems: Vec<Self> =
+            fs::read_dir(base).into_iter().flatten().filter_map(|entry| Self::open(&entry.ok()?.path()).ok()).collect();
+        systems.sort_by(|a, b| a.name.cmp(&b.name));
+        systems
+    }
+
+    /// iceoryx2's configuration of this domain.
+    #[must_use]
+    pub fn bus_config_path(&self) -> PathBuf {
+        self.runtime_dir.join("iceoryx2.toml")
+    }
+
+    /// The resolved configuration that all services of this system read.
+    #[must_use]
+    pub fn config_path(&self) -> PathBuf {
+        self.runtime_dir.join("config.toml")
+    }
+
+    /// Names of this system's files in shared memory.
+    #[must_use]
+    pub fn shared_memory_files(&self) -> Vec<PathBuf> {
+        let mut files: Vec<PathBuf> = fs::read_dir(SHARED_MEMORY_DIR)
+            .into_iter()
+            .flatten()
+            .filter_map(|entry| Some(entry.ok()?.path()))
+            .filter(|path| path.file_name().and_then(|n| n.to_str()).is_some_and(|n| n.starts_with(&self.prefix)))
+            .collect();
+        files.sort();
+        files
+    }
+
+    /// Removes everything that belongs to this system. Only when none of its processes runs: files removed under a
+    /// running process split the domain in two.
+    ///
+    /// # Errors
+    /// When the folder cannot be removed; shared memory is removed as far as possible first.
+    pub fn remove(&self) -> Result<(), SystemError> {
+        for file in self.shared_memory_files() {
+            if let Err(error) = fs::remove_file(&file) {
+                tracing::warn!(file = %file.display(), %error, "could not remove shared memory");
+            }
+        }
+        io(&self.runtime_dir, "remove", fs::remove_dir_all(&self.runtime_dir))
+    }
+}
+
+fn io<T>(path: &Path, action: &'static str, result: std::io::Result<T>) -> Result<T, SystemError> {
+    result.map_err(|source| SystemError::Io { path: path.to_owned(), action, source })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_system_is_found_by_name_alone_and_leaves_nothing() {
+        let base = tempfile::tempdir_in("/dev/shm").expect("tmpfs");
+        let system = System::create(base.path(), "one", 0).expect("made");
+        assert_eq!(System::find(base.path(), None).expect("the only one"), system);
+        assert_eq!(System::find(base.path(), Some("one")).expect("named"), system);
+        let other = System::create(base.path(), "two", 0).expect("made");
+        assert_ne!(other.prefix, system.prefix);
+        let error = System::find(base.path(), None).expect_err("two");
+        assert!(error.to_string().contains("one, two"), "{error}");
+        system.remove().expect("removed");
+        other.remove().expect("removed");
+        assert_eq!(fs::read_dir(base.path()).expect("base").count(), 0);
+    }
+
+    #[test]
+    fn a_path_too_long_for_sockets_is_refused() {
+        let error = System::create(Path::new(&format!("/dev/shm/{}", "x".repeat(80))), "n", 0).expect_err("too long");
+        assert!(error.to_string().contains("XDG_RUNTIME_DIR"), "{error}");
+    }
+}
