@@ -1,0 +1,173 @@
+//! From moments per splat to gradients per parameter: the projection, backwards.
+
+use crate::backward::MOMENTS;
+use crate::frame::Frame;
+use crate::frame::Row;
+use crate::model::{Block, LANES, ROW_LOG_SCALE, ROW_MEAN, ROW_OPACITY, ROW_ROTATION, ROW_SH, ROWS, SH_C0};
+use crate::projection::{Projected, View, project};
+use crate::simd::{Simd, build};
+
+/// A gradient beyond this in any parameter is a broken Gaussian: it is left as it is.
+const GRADIENT_MAX: f32 = 1e15;
+
+/// Gradients of one block of 16 Gaussians.
+pub(crate) struct BlockGradient<S: Simd> {
+    pub rows: [S::F; ROWS],
+    /// Lanes that changed at least one pixel and whose gradient is finite.
+    pub lanes: S::M,
+    /// Standard deviations, metres.
+    pub scales: [S::F; 3],
+}
+
+/// Sums a block's partials over tiles, in the order of the tiles, and takes them through the projection.
+#[inline(always)]
+pub(crate) fn block_gradient<S: Simd>(
+    s: S,
+    view: &View,
+    frame: &Frame,
+    (slots, touched): (&[Row], &[u8]),
+    block_index: usize,
+    block: &Block,
+) -> Option<BlockGradient<S>> {
+    let visible = frame.visible[block_index];
+    let zero = s.splat(0.0);
+    let mut rows = [zero; 16];
+    let mut drawn = 0_u16;
+    let mut bits = visible;
+    while bits != 0 {
+        let lane = bits.trailing_zeros() as usize;
+        bits &= bits - 1;
+        let footprint = frame.footprint(block_index * LANES + lane);
+        let range = footprint.slot..footprint.slot + footprint.width * footprint.height;
+        for (slot, &touched) in slots[range.clone()].iter().zip(&touched[range]) {
+            if touched != 0 {
+                rows[lane] = s.add(rows[lane], s.load(&slot.0));
+                drawn |= 1 << lane;
+            }
+        }
+    }
+    if drawn == 0 {
+        return None;
+    }
+    s.transpose(&mut rows);
+    let moments = build!(zero; MOMENTS; |i| rows[i]);
+    let projected = project(s, view, block, drawn);
+    let rows = parameter_gradients(s, view, &projected, &moments);
+    let mut size = zero;
+    for g in rows {
+        size = s.add(size, s.abs(g));
+    }
+    let lanes = s.and(s.mask(drawn), s.gt(s.splat(GRADIENT_MAX), size));
+    Some(BlockGradient { rows, lanes, scales: projected.scales })
+}
+
+/// Chain rule from the ten moments to the fourteen parameters.
+#[inline(always)]
+fn parameter_gradients<S: Simd>(s: S, view: &View, p: &Projected<S>, moments: &[S::F; MOMENTS]) -> [S::F; ROWS] {
+    let [h, hx, hy, hxx, hxy, hyy, red, green, blue, depth] = *moments;
+    let zero = s.splat(0.0);
+    let half = s.splat(0.5);
+    let two = s.splat(2.0);
+    let [ca, cb, cc] = p.conic;
+
+    // Mean in pixels.
+    let d_mean = [s.fma(ca, hx, s.mul(cb, hy)), s.fma(cb, hx, s.mul(cc, hy))];
+
+    // The gradient of the conic K is G, so that of the covariance is V = -K G K.
+    let (ga, gb, gc) = (s.mul(half, neg(s, hxx)), s.mul(half, neg(s, hxy)), s.mul(half, neg(s, hyy)));
+    let (p00, p01) = (s.fma(ca, ga, s.mul(cb, gb)), s.fma(ca, gb, s.mul(cb, gc)));
+    let (p10, p11) = (s.fma(cb, ga, s.mul(cc, gb)), s.fma(cb, gb, s.mul(cc, gc)));
+    let mut v00 = neg(s, s.fma(p00, ca, s.mul(p01, cb)));
+    let mut v01 = neg(s, s.fma(p00, cb, s.mul(p01, cc)));
+    let mut v11 = neg(s, s.fma(p10, cb, s.mul(p11, cc)));
+
+    // Peak alpha: opacity, and the compensation sqrt(det before / det after), unless clamped.
+    let h_alpha = s.keep(p.unclamped, h);
+    if view.compensated() {
+        let weight = s.mul(half, h_alpha);
+        let inv = s.div(s.splat(1.0), s.max(p.raw_det, s.splat(1e-30)));
+        let [a, b, c] = p.raw;
+        v00 = s.fma(weight, s.sub(s.mul(c, inv), ca), v00);
+        v01 = s.fma(weight, s.sub(neg(s, s.mul(b, inv)), cb), v01);
+        v11 = s.fma(weight, s.sub(s.mul(a, inv), cc), v11);
+    }
+    let d_logit = s.mul(h_alpha, s.sub(s.splat(1.0), p.opacity));
+
+    // Covariance = U Uᵀ, U = J M.
+    let d_u: [[S::F; 3]; 2] = [
+        build!(zero; 3; |k| s.mul(two, s.fma(v00, p.u[0][k], s.mul(v01, p.u[1][k])))),
+        build!(zero; 3; |k| s.mul(two, s.fma(v01, p.u[0][k], s.mul(v11, p.u[1][k])))),
+    ];
+    let gain = [s.mul(p.inv_z, s.splat(view.fx)), s.mul(p.inv_z, s.splat(view.fy))];
+    let d_m: [[S::F; 3]; 3] = [
+        build!(zero; 3; |k| s.mul(gain[0], d_u[0][k])),
+        build!(zero; 3; |k| s.mul(gain[1], d_u[1][k])),
+        build!(zero; 3; |k| neg(s, s.fma(s.mul(gain[0], p.jx), d_u[0][k], s.mul(s.mul(gain[1], p.jy), d_u[1][k])))),
+    ];
+    // J's entries depend on the camera point: its gains on z, its shear on x/z and y/z where not clamped.
+    let d_jx = s.keep(p.free_x, neg(s, s.mul(gain[0], dot(s, &d_u[0], &p.m[2]))));
+    let d_jy = s.keep(p.free_y, neg(s, s.mul(gain[1], dot(s, &d_u[1], &p.m[2]))));
+    let d_ratio_x = s.mul(gain[0], s.mul(d_mean[0], p.z));
+    let d_ratio_y = s.mul(gain[1], s.mul(d_mean[1], p.z));
+    let (d_x, d_y) = (s.mul(s.add(d_ratio_x, d_jx), p.inv_z), s.mul(s.add(d_ratio_y, d_jy), p.inv_z));
+    let mut d_z = s.sub(depth, s.mul(p.inv_z, s.add(dot(s, &d_u[0], &p.u[0]), dot(s, &d_u[1], &p.u[1]))));
+    let inv_z2 = s.mul(p.inv_z, p.inv_z);
+    d_z = s.fnma(s.mul(s.add(d_ratio_x, d_jx), p.x), inv_z2, d_z);
+    d_z = s.fnma(s.mul(s.add(d_ratio_y, d_jy), p.y), inv_z2, d_z);
+
+    let mut out = [zero; ROWS];
+    // Columns of the rotation.
+    let columns = build!([zero; 3]; 3; |j| build!(zero; 3; |i| s.splat(view.rotation[i][j])));
+    for j in 0..3 {
+        out[ROW_MEAN + j] = dot(s, &columns[j], &[d_x, d_y, d_z]);
+    }
+    // M = R Rot diag(s).
+    let mut d_rot = [[zero; 3]; 3];
+    for k in 0..3 {
+        let d_column = [d_m[0][k], d_m[1][k], d_m[2][k]];
+        out[ROW_LOG_SCALE + k] = dot(s, &d_column, &[p.m[0][k], p.m[1][k], p.m[2][k]]);
+        for (j, d_row) in d_rot.iter_mut().enumerate() {
+            d_row[k] = s.mul(p.scales[k], dot(s, &columns[j], &d_column));
+        }
+    }
+    let d_quat = quaternion_gradient(s, &p.quat, &d_rot);
+    let mut along = zero;
+    for i in 0..4 {
+        along = s.fma(p.quat[i], d_quat[i], along);
+    }
+    for i in 0..4 {
+        out[ROW_ROTATION + i] = s.mul(p.inv_quat_length, s.fnma(p.quat[i], along, d_quat[i]));
+    }
+    out[ROW_OPACITY] = d_logit;
+    for (k, d_color) in [red, green, blue].into_iter().enumerate() {
+        out[ROW_SH + k] = s.mul(s.splat(SH_C0), d_color);
+    }
+    out
+}
+
+/// Gradient of a unit quaternion (x, y, z, w) from that of its rotation matrix.
+#[inline(always)]
+fn quaternion_gradient<S: Simd>(s: S, q: &[S::F; 4], d: &[[S::F; 3]; 3]) -> [S::F; 4] {
+    let [x, y, z, w] = *q;
+    let two = s.splat(2.0);
+    let plus = [s.add(d[1][2], d[2][1]), s.add(d[0][2], d[2][0]), s.add(d[0][1], d[1][0])];
+    let minus = [s.sub(d[2][1], d[1][2]), s.sub(d[0][2], d[2][0]), s.sub(d[1][0], d[0][1])];
+    let twice =
+        [s.mul(two, s.add(d[1][1], d[2][2])), s.mul(two, s.add(d[0][0], d[2][2])), s.mul(two, s.add(d[0][0], d[1][1]))];
+    [
+        s.mul(two, s.fnma(x, twice[0], s.fma(y, plus[2], s.fma(z, plus[1], s.mul(w, minus[0]))))),
+        s.mul(two, s.fnma(y, twice[1], s.fma(x, plus[2], s.fma(z, plus[0], s.mul(w, minus[1]))))),
+        s.mul(two, s.fnma(z, twice[2], s.fma(x, plus[1], s.fma(y, plus[0], s.mul(w, minus[2]))))),
+        s.mul(two, s.fma(x, minus[0], s.fma(y, minus[1], s.mul(z, minus[2])))),
+    ]
+}
+
+#[inline(always)]
+fn neg<S: Simd>(s: S, a: S::F) -> S::F {
+    s.sub(s.splat(0.0), a)
+}
+
+#[inline(always)]
+fn dot<S: Simd>(s: S, a: &[S::F; 3], b: &[S::F; 3]) -> S::F {
+    s.fma(a[0], b[0], s.fma(a[1], b[1], s.mul(a[2], b[2])))
+}

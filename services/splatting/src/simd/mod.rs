@@ -1,0 +1,339 @@
+//! Sixteen-wide f32 arithmetic over `std::arch`, chosen at run time.
+//!
+//! Kernels are written once, generic over [`Simd`], and entered through [`dispatch`], which compiles each of them for
+//! AVX-512, for AVX2 with FMA and for plain Rust. Stable Rust, no `target-cpu` flags: a binary built anywhere uses what
+//! the machine it runs on has. A value of an implementation is the proof that its instructions exist, so calling a
+//! method is safe.
+
+#[cfg(target_arch = "x86_64")]
+mod avx2;
+#[cfg(target_arch = "x86_64")]
+mod avx512;
+mod portable;
+
+#[cfg(target_arch = "x86_64")]
+use {avx2::Avx2, avx512::Avx512};
+
+use portable::Portable;
+
+/// Instruction set of the engine's kernels. Results differ between sets in the last bits, never within one.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Isa {
+    /// AVX-512 F, DQ and VL: one register per 16 lanes.
+    Avx512,
+    /// AVX2 and FMA: two registers per 16 lanes.
+    Avx2,
+    /// Plain Rust, for every other machine: correct, and many times slower.
+    Portable,
+}
+
+impl Isa {
+    /// The widest set this machine has.
+    pub fn detect() -> Self {
+        [Self::Avx512, Self::Avx2].into_iter().find(|isa| isa.is_available()).unwrap_or(Self::Portable)
+    }
+
+    /// Whether this machine can run the set.
+    pub fn is_available(self) -> bool {
+        match self {
+            #[cfg(target_arch = "x86_64")]
+            Self::Avx512 => Avx512::detect().is_some(),
+            #[cfg(target_arch = "x86_64")]
+            Self::Avx2 => Avx2::detect().is_some(),
+            #[cfg(not(target_arch = "x86_64"))]
+            Self::Avx512 | Self::Avx2 => false,
+            Self::Portable => true,
+        }
+    }
+}
+
+/// A computation generic over the instruction set. `run` must be `#[inline(always)]`, with everything it calls.
+pub(crate) trait Kernel {
+    type Output;
+    fn run<S: Simd>(self, s: S) -> Self::Output;
+}
+
+/// Runs a kernel with an instruction set; falls back to plain Rust where the machine lacks it.
+pub(crate) fn dispatch<K: Kernel>(isa: Isa, kernel: K) -> K::Output {
+    match isa {
+        #[cfg(target_arch = "x86_64")]
+        Isa::Avx512 => match Avx512::detect() {
+            Some(s) => avx512::enter(s, kernel),
+            None => kernel.run(Portable),
+        },
+        #[cfg(target_arch = "x86_64")]
+        Isa::Avx2 => match Avx2::detect() {
+            Some(s) => avx2::enter(s, kernel),
+            None => kernel.run(Portable),
+        },
+        _ => kernel.run(Portable),
+    }
+}
+
+/// Sixteen lanes of f32.
+pub(crate) trait Simd: Copy {
+    /// Sixteen numbers.
+    type F: Copy;
+    /// Sixteen truth values.
+    type M: Copy;
+
+    fn splat(self, x: f32) -> Self::F;
+    fn load(self, x: &[f32; 16]) -> Self::F;
+    fn store(self, x: Self::F, to: &mut [f32; 16]);
+    /// Four rows of four numbers, `stride` apart, from `at` on.
+    fn load_4x4(self, from: &[f32], at: usize, stride: usize) -> Self::F;
+    fn store_4x4(self, x: Self::F, to: &mut [f32], at: usize, stride: usize);
+
+    fn add(self, a: Self::F, b: Self::F) -> Self::F;
+    fn sub(self, a: Self::F, b: Self::F) -> Self::F;
+    fn mul(self, a: Self::F, b: Self::F) -> Self::F;
+    fn div(self, a: Self::F, b: Self::F) -> Self::F;
+    /// a * b + c
+    fn fma(self, a: Self::F, b: Self::F, c: Self::F) -> Self::F;
+    /// c - a * b
+    fn fnma(self, a: Self::F, b: Self::F, c: Self::F) -> Self::F;
+    /// The second operand where one is NaN.
+    fn min(self, a: Self::F, b: Self::F) -> Self::F;
+    /// The second operand where one is NaN.
+    fn max(self, a: Self::F, b: Self::F) -> Self::F;
+    fn sqrt(self, a: Self::F) -> Self::F;
+    /// 1 / a to at least 14 bits, for a in the normal range.
+    fn reciprocal_14(self, a: Self::F) -> Self::F;
+    fn abs(self, a: Self::F) -> Self::F;
+
+    /// a >= b; false where one is NaN.
+    fn ge(self, a: Self::F, b: Self::F) -> Self::M;
+    /// a > b; false where one is NaN.
+    fn gt(self, a: Self::F, b: Self::F) -> Self::M;
+    fn and(self, a: Self::M, b: Self::M) -> Self::M;
+    /// Lane i is bit i.
+    fn bits(self, m: Self::M) -> u16;
+    fn mask(self, bits: u16) -> Self::M;
+    /// a where the mask holds, else b.
+    fn select(self, m: Self::M, a: Self::F, b: Self::F) -> Self::F;
+    /// a where the mask holds, else 0.
+    fn keep(self, m: Self::M, a: Self::F) -> Self::F;
+
+    /// (r, n) with 2^x = 2^r * scale(., n) and r in [0, 1).
+    fn exp2_split(self, x: Self::F) -> (Self::F, Self::F);
+    /// p * 2^floor(n), for the n of [`Simd::exp2_split`]; 0 below the range of normal numbers.
+    fn exp2_scale(self, p: Self::F, n: Self::F) -> Self::F;
+    /// (e, m) with x = m * 2^e and m in [1, 2), for positive normal x.
+    fn exponent_mantissa(self, x: Self::F) -> (Self::F, Self::F);
+
+    /// Transposes 16 rows of 16 lanes.
+    fn transpose(self, rows: &mut [Self::F; 16]);
+    /// Lane i is the sum over the lanes of row i; lanes 10 to 15 are 0.
+    fn sum_rows_10(self, rows: &[Self::F; 10]) -> Self::F;
+
+    /// Appends to list `b`, for each lane i with bit b of `hits[i]` set, the number `first + i`; counts follow. Up to 16
+    /// numbers after the new end of each list may be overwritten.
+    fn append_hits<const N: usize>(
+        self,
+        hits: &[u32; 16],
+        first: u16,
+        lists: &mut [[u16; N]; 16],
+        counts: &mut [usize; 16],
+    );
+
+    /// 2^x with a degree-4 polynomial (relative error 4e-6), for alphas.
+    #[inline(always)]
+    fn exp2_fast(self, x: Self::F) -> Self::F {
+        let (r, n) = self.exp2_split(x);
+        self.exp2_scale(polynomial(self, &EXP2_4, r), n)
+    }
+
+    /// 2^x to f32 accuracy.
+    #[inline(always)]
+    fn exp2(self, x: Self::F) -> Self::F {
+        let (r, n) = self.exp2_split(x);
+        self.exp2_scale(polynomial(self, &EXP2_6, r), n)
+    }
+
+    /// e^x to f32 accuracy for moderate x.
+    #[inline(always)]
+    fn exp(self, x: Self::F) -> Self::F {
+        self.exp2(self.mul(x, self.splat(std::f32::consts::LOG2_E)))
+    }
+
+    /// Base-2 logarithm of positive normal numbers, by the series of atanh.
+    #[inline(always)]
+    fn log2(self, x: Self::F) -> Self::F {
+        let (e, m) = self.exponent_mantissa(x);
+        let one = self.splat(1.0);
+        // Centre the mantissa on 1, so that the series is short and exact near 1.
+        let high = self.gt(m, self.splat(std::f32::consts::SQRT_2));
+        let m = self.select(high, self.mul(m, self.splat(0.5)), m);
+        let e = self.select(high, self.add(e, one), e);
+        let s = self.div(self.sub(m, one), self.add(m, one));
+        let s2 = self.mul(s, s);
+        let p = polynomial(self, &[1.0 / 9.0, 1.0 / 7.0, 1.0 / 5.0, 1.0 / 3.0, 1.0], s2);
+        self.fma(self.mul(s, p), self.splat(2.0 * std::f32::consts::LOG2_E), e)
+    }
+}
+
+/// [`Simd::append_hits`] bit by bit.
+#[inline(always)]
+fn append_hits_one_by_one<const N: usize>(
+    hits: &[u32; 16],
+    first: u16,
+    lists: &mut [[u16; N]; 16],
+    counts: &mut [usize; 16],
+) {
+    for (i, &hits) in hits.iter().enumerate() {
+        let mut hits = hits & 0xffff;
+        while hits != 0 {
+            let list = hits.trailing_zeros() as usize;
+            hits &= hits - 1;
+            lists[list][counts[list]] = first + i as u16;
+            counts[list] += 1;
+        }
+    }
+}
+
+/// Polynomial with the highest power first.
+#[inline(always)]
+fn polynomial<S: Simd, const N: usize>(s: S, coefficients: &[f32; N], x: S::F) -> S::F {
+    let mut p = s.splat(coefficients[0]);
+    for c in &coefficients[1..] {
+        p = s.fma(p, x, s.splat(*c));
+    }
+    p
+}
+
+/// An array built by a loop: `build!(first; length; |i| value)`.
+///
+/// Kernels do not use `array::from_fn`, `map` or closures on vectors: a closure is a function of its own, which is
+/// compiled without the instruction set of the kernel around it and then called with vectors in memory (ten times
+/// slower, measured).
+macro_rules! build {
+    ($first:expr; $length:expr; |$i:ident| $value:expr) => {{
+        let mut out = [$first; $length];
+        let mut $i = 0;
+        while $i < $length {
+            out[$i] = $value;
+            $i += 1;
+        }
+        out
+    }};
+}
+pub(crate) use build;
+
+// Minimax polynomials of 2^r on [0, 1), relative error, highest power first.
+const EXP2_4: [f32; 5] = [0.013534168, 0.05201146, 0.24144275, 0.69300383, 1.0000026];
+#[expect(clippy::approx_constant, reason = "a minimax coefficient lies near ln 2 and is not it")]
+const EXP2_6: [f32; 7] = [0.00021702256, 0.0012439687, 0.009678841, 0.05548334, 0.24022983, 0.693147, 1.0];
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Runs a few operations on every set and returns what they gave.
+    struct Probe([f32; 16]);
+
+    impl Kernel for Probe {
+        type Output = Vec<[f32; 16]>;
+        #[inline(always)]
+        fn run<S: Simd>(self, s: S) -> Self::Output {
+            let x = s.load(&self.0);
+            let mut rows = [x; 16];
+            for (i, row) in rows.iter_mut().enumerate() {
+                *row = s.add(x, s.splat(100.0 * i as f32));
+            }
+            let ten: [S::F; 10] = std::array::from_fn(|i| rows[i]);
+            let sums = s.sum_rows_10(&ten);
+            s.transpose(&mut rows);
+            let mut image = vec![0.0; 64];
+            s.store_4x4(x, &mut image, 5, 12);
+            let block = s.load_4x4(&image, 5, 12);
+            let mask = s.ge(x, s.splat(0.5));
+            let again = s.mask(s.bits(mask));
+            let out = [
+                s.exp2(x),
+                s.exp2_fast(x),
+                s.log2(s.add(s.abs(x), s.splat(1e-6))),
+                s.reciprocal_14(s.add(s.abs(x), s.splat(0.1))),
+                rows[3],
+                sums,
+                block,
+                s.keep(again, x),
+                s.select(mask, s.splat(1.0), s.splat(-1.0)),
+                s.sqrt(s.abs(x)),
+            ];
+            check_append(s);
+            out.iter()
+                .map(|&v| {
+                    let mut lanes = [0.0; 16];
+                    s.store(v, &mut lanes);
+                    lanes
+                })
+                .collect()
+        }
+    }
+
+    /// Appending gives what appending one by one gives.
+    #[inline(always)]
+    fn check_append<S: Simd>(s: S) {
+        let (mut lists, mut counts) = ([[0_u16; 64]; 16], [0_usize; 16]);
+        let (mut expected, mut expected_counts) = (lists, counts);
+        for step in 0..2_u32 {
+            let hits: [u32; 16] = std::array::from_fn(|i| (i as u32 * 0x9e37 + step * 0x1234) & 0xffff);
+            s.append_hits(&hits, 16 * step as u16, &mut lists, &mut counts);
+            append_hits_one_by_one(&hits, 16 * step as u16, &mut expected, &mut expected_counts);
+        }
+        assert_eq!(counts, expected_counts);
+        for ((list, expected), count) in lists.iter().zip(&expected).zip(counts) {
+            assert_eq!(list[..count], expected[..count]);
+        }
+        assert!(counts.iter().sum::<usize>() > 50);
+    }
+
+    fn expected(x: [f32; 16]) -> Vec<[f32; 16]> {
+        let map = |f: &dyn Fn(f64) -> f64| x.map(|v| f(f64::from(v)) as f32);
+        let sum: f64 = x.iter().map(|&v| f64::from(v)).sum();
+        vec![
+            map(&f64::exp2),
+            map(&f64::exp2),
+            map(&|v| (v.abs() + 1e-6).log2()),
+            map(&|v| 1.0 / (v.abs() + 0.1)),
+            std::array::from_fn(|i| x[3] + 100.0 * i as f32),
+            std::array::from_fn(|i| if i < 10 { (sum + 1600.0 * i as f64) as f32 } else { 0.0 }),
+            x,
+            x.map(|v| if v >= 0.5 { v } else { 0.0 }),
+            x.map(|v| if v >= 0.5 { 1.0 } else { -1.0 }),
+            map(&|v| v.abs().sqrt()),
+        ]
+    }
+
+    #[test]
+    fn every_instruction_set_computes_the_same_thing() {
+        let inputs: [[f32; 16]; 3] = [
+            std::array::from_fn(|i| -9.0 + 1.3 * i as f32),
+            std::array::from_fn(|i| 0.01 * i as f32 + 0.45),
+            std::array::from_fn(|i| -100.0 + 13.0 * i as f32),
+        ];
+        // Relative error allowed for each probe; the third is absolute near log2(1) = 0.
+        let tolerance = [4e-7, 6e-6, 3e-7, 1e-4, 1e-6, 1e-5, 0.0, 0.0, 0.0, 2e-7];
+        let mut ran = 0;
+        for isa in [Isa::Avx512, Isa::Avx2, Isa::Portable].into_iter().filter(|isa| isa.is_available()) {
+            for x in inputs {
+                let got = dispatch(isa, Probe(x));
+                for ((got, want), tolerance) in got.iter().zip(expected(x)).zip(tolerance) {
+                    for (g, w) in got.iter().zip(want) {
+                        assert!((g - w).abs() <= tolerance * w.abs().max(1.0e-3), "{isa:?}: {g} instead of {w}");
+                    }
+                }
+                ran += 1;
+            }
+        }
+        assert!(ran >= 3);
+    }
+
+    #[test]
+    fn exp2_underflows_to_zero() {
+        for isa in [Isa::Avx512, Isa::Avx2, Isa::Portable].into_iter().filter(|isa| isa.is_available()) {
+            let got = dispatch(isa, Probe([-1e9; 16]));
+            assert!(got[0].iter().chain(&got[1]).all(|v| v.abs() < 1e-37), "{isa:?}: {got:?}");
+        }
+    }
+}

@@ -1,0 +1,129 @@
+//! Stable radix sort of splats by depth: two passes of 11 bits.
+//!
+//! Depths are positive, so their bits order like integers. The range of a frame's depths is shifted to 22 bits: for
+//! depths within a factor of four that is 2^-21 relative, finer than the depths themselves are known.
+
+#![expect(unsafe_code, reason = "tasks write disjoint parts of shared buffers")]
+
+use crate::workers::{Shared, Workers};
+
+const DIGIT_BITS: u32 = 11;
+const DIGITS: usize = 1 << DIGIT_BITS;
+/// Below this many items the passes run on one thread: waking another costs more.
+const PARALLEL_FROM: usize = 8192;
+
+/// A visible splat: its depth's bits, its index, and the tiles of its bounding box (first x, y, last x, y).
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(crate) struct Item {
+    pub key: u32,
+    pub gaussian: u32,
+    pub tiles: [u16; 4],
+}
+
+impl Item {
+    /// Calls `f` with the index of each tile of the bounding box.
+    #[inline(always)]
+    pub(crate) fn for_each_tile(&self, tiles_x: usize, mut f: impl FnMut(usize)) {
+        let [x0, y0, x1, y1] = self.tiles.map(usize::from);
+        for y in y0..=y1 {
+            for x in x0..=x1 {
+                f(y * tiles_x + x);
+            }
+        }
+    }
+}
+
+/// Sorts `items`, whose keys lie in `low..=high`, by key; equal keys keep their order. `spare` is as long as `items`.
+pub(crate) fn sort_by_key(workers: &Workers, items: &mut [Item], spare: &mut [Item], low: u32, high: u32) {
+    let range_bits = u32::BITS - high.saturating_sub(low).leading_zeros();
+    let shift = range_bits.saturating_sub(2 * DIGIT_BITS);
+    pass(workers, items, spare, |item| (item.key - low) >> shift);
+    pass(workers, spare, items, |item| (item.key - low) >> (shift + DIGIT_BITS));
+}
+
+/// One stable counting pass by the low digit of `key`.
+fn pass(workers: &Workers, from: &[Item], to: &mut [Item], key: impl Fn(&Item) -> u32 + Sync) {
+    let parts = if from.len() < PARALLEL_FROM { 1 } else { workers.count() };
+    let length = from.len().div_ceil(parts).max(1);
+    let part = |p: usize| &from[(p * length).min(from.len())..((p + 1) * length).min(from.len())];
+    let digit = |item: &Item| key(item) as usize % DIGITS;
+    let mut counts = vec![0_u32; parts * DIGITS];
+    let shared = Shared::new(&mut counts);
+    workers.run(parts, |_, p| {
+        // SAFETY: one range of counters per part.
+        let counts = unsafe { shared.slice_mut(p * DIGITS..(p + 1) * DIGITS) };
+        for item in part(p) {
+            counts[digit(item)] += 1;
+        }
+    });
+    let mut total = 0;
+    for d in 0..DIGITS {
+        for p in 0..parts {
+            let count = std::mem::replace(&mut counts[p * DIGITS + d], total);
+            total += count;
+        }
+    }
+    let shared = Shared::new(&mut counts);
+    let to = Shared::new(to);
+    workers.run(parts, |_, p| {
+        // SAFETY: one range of counters per part.
+        let next = unsafe { shared.slice_mut(p * DIGITS..(p + 1) * DIGITS) };
+        for item in part(p) {
+            let d = digit(item);
+            // SAFETY: the prefix sums give every (digit, part) a range of its own.
+            unsafe { to.write(next[d] as usize, *item) };
+            next[d] += 1;
+        }
+    });
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn sorts_stably_and_the_same_for_any_number_of_workers() {
+        let mut state = 1_u32;
+        let depths: Vec<f32> = (0..20_000)
+            .map(|i| {
+                state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+                if i % 7 == 0 { 2.0 } else { 1.0 + (state >> 8) as f32 / 1e7 }
+            })
+            .collect();
+        let items: Vec<Item> = depths
+            .iter()
+            .enumerate()
+            .map(|(i, d)| Item { key: d.to_bits(), gaussian: i as u32, tiles: [0; 4] })
+            .collect();
+        let mut expected = items.clone();
+        expected.sort_by_key(|item| item.key >> 1);
+        let low = items.iter().map(|i| i.key).min().unwrap();
+        let high = items.iter().map(|i| i.key).max().unwrap();
+        let sorted = |threads: usize| {
+            let mut items = items.clone();
+            let mut spare = items.clone();
+            sort_by_key(&Workers::new(threads).unwrap(), &mut items, &mut spare, low, high);
+            items
+        };
+        let one = sorted(1);
+        assert_eq!(one, sorted(2));
+        assert_eq!(one, sorted(3));
+        for pair in one.windows(2) {
+            let (a, b) = (f32::from_bits(pair[0].key), f32::from_bits(pair[1].key));
+            assert!(a <= b * (1.0 + 1e-6));
+            assert!(a != b || pair[0].gaussian < pair[1].gaussian);
+        }
+        let mut seen: Vec<u32> = one.iter().map(|i| i.gaussian).collect();
+        seen.sort_unstable();
+        assert!(seen.iter().enumerate().all(|(i, &g)| i as u32 == g));
+    }
+
+    #[test]
+    fn nothing_and_one_item_are_sorted() {
+        let workers = Workers::sequential();
+        sort_by_key(&workers, &mut [], &mut [], 0, 0);
+        let mut one = [Item { key: 7, gaussian: 3, tiles: [1; 4] }];
+        sort_by_key(&workers, &mut one, &mut [Item::default()], 7, 7);
+        assert_eq!(one[0].gaussian, 3);
+    }
+}

@@ -1,0 +1,255 @@
+//! One training step: render, loss, backward pass, Adam.
+
+#![expect(unsafe_code, reason = "tasks write disjoint parts of shared buffers")]
+
+use std::time::Instant;
+
+use crate::backward::BackwardTile;
+use crate::engine::Engine;
+use crate::frame::{Frame, Row, TILE};
+use crate::gradient::block_gradient;
+use crate::loss;
+use crate::model::{Block, Gaussians, LANES, Lanes, ROW_LOG_SCALE, ROWS};
+use crate::optimiser::{AdamStep, Optimiser};
+use crate::projection::View;
+use crate::settings::{LossTerms, TrainingSettings};
+use crate::simd::{Kernel, Simd, build, dispatch};
+use crate::view::TrainingView;
+use crate::workers::Shared;
+
+/// Blocks of 16 Gaussians that one task takes a step for.
+const CHUNK_BLOCKS: usize = 32;
+
+/// Gradients of the fourteen parameters of a Gaussian, in the order mean x y z, log scales, rotation x y z w, opacity
+/// logit, SH of red, green, blue.
+pub type ParameterGradient = [f32; ROWS];
+
+impl Engine {
+    /// One step of Adam on one view. Only Gaussians that changed a pixel of the view move, each with its own step count.
+    ///
+    /// Gaussians that the optimiser does not know yet get zero state. Broken Gaussians (not finite) and broken
+    /// gradients are left alone, so nothing that is finite before the step is not finite after it.
+    pub fn train_step(
+        &mut self,
+        gaussians: &mut Gaussians,
+        optimiser: &mut Optimiser,
+        view: &TrainingView,
+        settings: &TrainingSettings,
+    ) -> LossTerms {
+        optimiser.resize(gaussians.len());
+        self.corrections.update(settings.betas);
+        let terms = self.accumulate(gaussians, view, settings);
+        let accumulated = Instant::now();
+        let pass = ParameterPass::new(self, view, settings, gaussians.len());
+        let adam = AdamStep::new(settings, &self.corrections);
+        let chunks = gaussians.blocks().len().div_ceil(CHUNK_BLOCKS);
+        let mut isotropic = vec![0.0; chunks];
+        let results = Shared::new(&mut isotropic);
+        let count = gaussians.blocks().len();
+        let total = gaussians.len();
+        let blocks = Shared::new(gaussians.blocks_mut());
+        let first = Shared::new(&mut optimiser.first);
+        let second = Shared::new(&mut optimiser.second);
+        let steps = Shared::new(&mut optimiser.steps);
+        self.workers.run(chunks, |_, chunk| {
+            let range = chunk * CHUNK_BLOCKS..count.min((chunk + 1) * CHUNK_BLOCKS);
+            let lanes = range.start * LANES..total.min(range.end * LANES);
+            // SAFETY: the ranges of different chunks do not overlap.
+            let kernel = unsafe {
+                AdamChunk {
+                    pass: &pass,
+                    adam: &adam,
+                    start: range.start,
+                    blocks: blocks.slice_mut(range.clone()),
+                    first: first.slice_mut(range.clone()),
+                    second: second.slice_mut(range),
+                    steps: steps.slice_mut(lanes),
+                }
+            };
+            // SAFETY: one task per chunk.
+            unsafe { results.write(chunk, dispatch(self.isa, kernel)) };
+        });
+        self.stage_times[6] = accumulated.elapsed();
+        finish(terms, &isotropic, gaussians.len(), settings)
+    }
+
+    /// The loss of a view and its gradient by every parameter; nothing moves. Zero for Gaussians that change no pixel.
+    pub fn gradient(
+        &mut self,
+        gaussians: &Gaussians,
+        view: &TrainingView,
+        settings: &TrainingSettings,
+    ) -> (LossTerms, Vec<ParameterGradient>) {
+        let terms = self.accumulate(gaussians, view, settings);
+        let pass = ParameterPass::new(self, view, settings, gaussians.len());
+        let mut isotropic = Vec::new();
+        let mut gradients = vec![[0.0; ROWS]; gaussians.len()];
+        for (index, block) in gaussians.blocks().iter().enumerate() {
+            let (gradient, sum) = dispatch(self.isa, GradientBlock { pass: &pass, index, block });
+            isotropic.push(sum);
+            for (lane, to) in gradients[index * LANES..].iter_mut().take(LANES).enumerate() {
+                *to = std::array::from_fn(|row| gradient.0[row].0[lane]);
+            }
+        }
+        (finish(terms, &isotropic, gaussians.len(), settings), gradients)
+    }
+
+    /// Renders the view, evaluates the loss, and leaves the moments of every (tile, Gaussian) in the slots.
+    fn accumulate(&mut self, gaussians: &Gaussians, view: &TrainingView, settings: &TrainingSettings) -> LossTerms {
+        let camera = view.camera();
+        let start = Instant::now();
+        self.frame.project(self.isa, &self.workers, gaussians, camera, &settings.render);
+        let projected = Instant::now();
+        self.frame.sort(&self.workers);
+        let sorted = Instant::now();
+        self.frame.bin(&self.workers);
+        let binned = Instant::now();
+        self.blend(camera, &settings.render, true);
+        let blended = Instant::now();
+        let terms = self.loss.evaluate(self.isa, &self.workers, &self.ssim_scratch, &self.frame.pixels, view, settings);
+        let evaluated = Instant::now();
+        self.backward(settings);
+        let ends = [start, projected, sorted, binned, blended, evaluated, Instant::now()];
+        for (time, pair) in self.stage_times.iter_mut().zip(ends.windows(2)) {
+            *time = pair[1] - pair[0];
+        }
+        terms
+    }
+
+    pub(crate) fn backward(&mut self, settings: &TrainingSettings) {
+        let frame = &self.frame;
+        if self.slots.len() < frame.slots {
+            // A quarter more than needed: the number changes from view to view.
+            self.slots.resize(frame.slots + frame.slots / 4, Lanes([0.0; LANES]));
+        }
+        self.touched.clear();
+        self.touched.resize(frame.slots, 0);
+        let slots = Shared::new(&mut self.slots);
+        let touched = Shared::new(&mut self.touched);
+        self.workers.run(frame.tiles(), |worker, task| {
+            let tile = frame.schedule[task] as usize;
+            let (tile_x, tile_y) = (tile % frame.tiles_x, tile / frame.tiles_x);
+            let entries = frame.tile_entries(tile);
+            self.backward_scratch.with(worker, |scratch| {
+                let kernel = BackwardTile {
+                    origin: [tile_x * TILE, tile_y * TILE],
+                    entries,
+                    rows: &frame.rows,
+                    contributors: &self.contributors[tile],
+                    pixels: &frame.pixels[tile],
+                    gradients: &self.loss.gradients[tile],
+                    alpha_min: settings.render.alpha_min,
+                    scratch,
+                };
+                dispatch(self.isa, kernel);
+                for ((&gaussian, sum), &has) in entries.iter().zip(&scratch.sums).zip(&scratch.touched) {
+                    if has {
+                        let slot = frame.footprint(gaussian as usize).slot_in(tile_x, tile_y);
+                        // SAFETY: every (tile, Gaussian) has a slot of its own, and each tile is given to one task.
+                        unsafe {
+                            slots.write(slot, *sum);
+                            touched.write(slot, 1);
+                        }
+                    }
+                }
+            });
+        });
+    }
+}
+
+/// Adds up the regulariser in the order of the model, and weighs the terms.
+fn finish(terms: LossTerms, isotropic: &[f64], count: usize, settings: &TrainingSettings) -> LossTerms {
+    let isotropic_m = isotropic.iter().sum::<f64>() / (3 * count.max(1)) as f64;
+    LossTerms { isotropic_m, ..terms }.weighted(settings)
+}
+
+/// What the pass over parameters reads.
+struct ParameterPass<'a> {
+    view: View,
+    frame: &'a Frame,
+    slots: &'a [Row],
+    touched: &'a [u8],
+    /// Isotropic weight divided by the number of standard deviations of the model.
+    isotropic: f32,
+}
+
+impl<'a> ParameterPass<'a> {
+    fn new(engine: &'a Engine, view: &TrainingView, settings: &TrainingSettings, count: usize) -> Self {
+        Self {
+            view: View::new(view.camera(), &settings.render),
+            frame: &engine.frame,
+            slots: &engine.slots,
+            touched: &engine.touched,
+            isotropic: settings.isotropic_weight / (3 * count.max(1)) as f32,
+        }
+    }
+
+    /// Gradient of one block with the regulariser, and the regulariser's sum |s - mean(s)|.
+    #[inline(always)]
+    fn block<S: Simd>(&self, s: S, index: usize, block: &Block) -> Option<([S::F; ROWS], S::M, f64)> {
+        let partials = (self.slots, self.touched);
+        let mut gradient = block_gradient(s, &self.view, self.frame, partials, index, block)?;
+        let mut sum = 0.0;
+        if self.isotropic != 0.0 {
+            let third = s.splat(1.0 / 3.0);
+            let scales = gradient.scales;
+            let mean = s.mul(s.add(s.add(scales[0], scales[1]), scales[2]), third);
+            let difference = build!(mean; 3; |k| s.sub(scales[k], mean));
+            let sign = build!(mean; 3; |k| loss::sign(s, difference[k]));
+            let mean_sign = s.mul(s.add(s.add(sign[0], sign[1]), sign[2]), third);
+            for k in 0..3 {
+                let d = s.mul(s.mul(s.sub(sign[k], mean_sign), scales[k]), s.splat(self.isotropic));
+                gradient.rows[ROW_LOG_SCALE + k] = s.add(gradient.rows[ROW_LOG_SCALE + k], d);
+                sum += loss::sum(s, s.keep(gradient.lanes, s.abs(difference[k])));
+            }
+        }
+        Some((gradient.rows, gradient.lanes, sum))
+    }
+}
+
+struct AdamChunk<'a> {
+    pass: &'a ParameterPass<'a>,
+    adam: &'a AdamStep<'a>,
+    start: usize,
+    blocks: &'a mut [Block],
+    first: &'a mut [Block],
+    second: &'a mut [Block],
+    steps: &'a mut [u32],
+}
+
+impl Kernel for AdamChunk<'_> {
+    type Output = f64;
+
+    #[inline(always)]
+    fn run<S: Simd>(self, s: S) -> f64 {
+        let mut isotropic = 0.0;
+        let state = self.first.iter_mut().zip(self.second).zip(self.steps.chunks_mut(LANES));
+        for (i, (block, ((first, second), steps))) in self.blocks.iter_mut().zip(state).enumerate() {
+            if let Some((gradient, lanes, sum)) = self.pass.block(s, self.start + i, block) {
+                isotropic += sum;
+                self.adam.apply(s, &gradient, lanes, block, (first, second, steps));
+            }
+        }
+        isotropic
+    }
+}
+
+struct GradientBlock<'a> {
+    pass: &'a ParameterPass<'a>,
+    index: usize,
+    block: &'a Block,
+}
+
+impl Kernel for GradientBlock<'_> {
+    type Output = (Block, f64);
+
+    #[inline(always)]
+    fn run<S: Simd>(self, s: S) -> (Block, f64) {
+        let mut out = Block::ZERO;
+        let Some((rows, lanes, sum)) = self.pass.block(s, self.index, self.block) else { return (out, 0.0) };
+        for (to, row) in out.0.iter_mut().zip(rows) {
+            s.store(s.keep(lanes, row), &mut to.0);
+        }
+        (out, sum)
+    }
+}
