@@ -1,0 +1,104 @@
+//! All of px4-link's channels.
+
+use shared_types::bus::{Bus, BusError, Publisher, ReplyAddress, Server, Subscriber};
+use shared_types::channel::{AliveChannel, VehicleCommandChannel, VehicleStateChannel, VehicleTargetChannel};
+use shared_types::messages::{CommandReply, VehicleState};
+
+use crate::logic::Core;
+
+/// The channels.
+pub struct Ports {
+    state: Publisher<VehicleStateChannel>,
+    targets: Subscriber<VehicleTargetChannel>,
+    alive: Subscriber<AliveChannel>,
+    commands: Server<VehicleCommandChannel>,
+    sent: u64,
+    received: u64,
+    dropped: u64,
+}
+
+impl core::fmt::Debug for Ports {
+    fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
+        f.debug_struct("Ports").field("sent", &self.sent).field("received", &self.received).finish_non_exhaustive()
+    }
+}
+
+impl Ports {
+    /// Opens all channels.
+    ///
+    /// # Errors
+    /// When one cannot be opened.
+    pub fn open(bus: &Bus) -> Result<Self, BusError> {
+        Ok(Self {
+            state: bus.publisher()?,
+            targets: bus.subscriber()?,
+            alive: bus.subscriber()?,
+            commands: bus.server()?,
+            sent: 0,
+            received: 0,
+            dropped: 0,
+        })
+    }
+
+    /// Gives everything that has come to the link.
+    ///
+    /// # Errors
+    /// When a channel is broken.
+    pub fn receive(&mut self, now_ns: u64, core: &mut Core) -> Result<(), BusError> {
+        while let Some(alive) = self.alive.receive(now_ns)? {
+            self.received += 1;
+            core.on_alive(alive.sent_ns());
+        }
+        while let Some(request) = self.commands.receive(now_ns)? {
+            self.received += 1;
+            core.on_command(now_ns, request.address(), request.header());
+        }
+        while let Some(target) = self.targets.receive(now_ns)? {
+            self.received += 1;
+            core.on_target(target.header(), target.items());
+        }
+        Ok(())
+    }
+
+    /// Drops what has come: it was meant for an earlier life.
+    ///
+    /// # Errors
+    /// When a channel is broken.
+    pub fn forget(&mut self) -> Result<(), BusError> {
+        self.alive.clear()?;
+        self.targets.clear()
+    }
+
+    /// Publishes the vehicle's state.
+    ///
+    /// # Errors
+    /// When the channel is broken; a missing chunk is counted and survived.
+    pub fn publish(&mut self, now_ns: u64, state: &VehicleState) -> Result<(), BusError> {
+        let result = self.state.send(now_ns, state.position_stamp_ns, state);
+        self.count(result)
+    }
+
+    /// Replies to a request.
+    ///
+    /// # Errors
+    /// When the channel is broken; a missing chunk is counted, and the client asks again.
+    pub fn reply(&mut self, now_ns: u64, to: &ReplyAddress, reply: &CommandReply) -> Result<(), BusError> {
+        let result = self.commands.reply(now_ns, to, reply, &[]);
+        self.count(result)
+    }
+
+    fn count(&mut self, result: Result<(), BusError>) -> Result<(), BusError> {
+        match result {
+            Ok(()) => self.sent += 1,
+            Err(BusError::NoChunk { .. }) => self.dropped += 1,
+            Err(error) => return Err(error),
+        }
+        Ok(())
+    }
+
+    /// Messages received, sent, dropped.
+    #[must_use]
+    pub fn counts(&self) -> (u64, u64, u64) {
+        (self.received, self.sent, self.dropped + self.targets.lost() + self.alive.lost())
+    }
+}

@@ -1,0 +1,132 @@
+//! What must outlive px4-link: the checked way back, and whose vehicle it was. Small files in the system folder, whole or
+//! absent.
+
+use std::io::Write as _;
+use std::path::{Path, PathBuf};
+
+use serde::{Deserialize, Serialize};
+use shared_types::messages::Waypoint;
+
+use crate::frames::KeptTransform;
+
+/// The way home from the last target: its path, then the way back from its end.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+pub struct WayBack {
+    /// Each: x, y, z, yaw, gimbal pitch, speed.
+    pub points: Vec<[f64; 6]>,
+}
+
+impl WayBack {
+    /// Of waypoints.
+    #[must_use]
+    pub fn of(waypoints: &[Waypoint]) -> Self {
+        let points = waypoints
+            .iter()
+            .map(|w| [w.position_m[0], w.position_m[1], w.position_m[2], w.yaw_rad, w.gimbal_pitch_rad, w.speed_mps])
+            .collect();
+        Self { points }
+    }
+
+    /// As waypoints; those with numbers that are not finite are left out.
+    #[must_use]
+    pub fn waypoints(&self) -> Vec<Waypoint> {
+        self.points
+            .iter()
+            .filter(|p| p.iter().all(|v| v.is_finite()))
+            .map(|&[x, y, z, yaw_rad, gimbal_pitch_rad, speed_mps]| Waypoint {
+                position_m: [x, y, z],
+                yaw_rad,
+                gimbal_pitch_rad,
+                speed_mps,
+            })
+            .collect()
+    }
+}
+
+/// What is remembered of the flight.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+pub struct Kept {
+    /// World from local.
+    pub transform: KeptTransform,
+    /// Whether the vehicle flew by our command.
+    pub ours: bool,
+    /// Ids up to this one were seen as targets.
+    pub last_target_id: u64,
+}
+
+/// The files.
+#[derive(Debug, Clone)]
+pub struct Store {
+    folder: PathBuf,
+}
+
+impl Store {
+    /// Files in this folder.
+    #[must_use]
+    pub fn new(folder: &Path) -> Self {
+        Self { folder: folder.to_owned() }
+    }
+
+    fn read<T: Default + serde::de::DeserializeOwned>(&self, name: &str) -> T {
+        let path = self.folder.join(name);
+        let Ok(text) = std::fs::read_to_string(&path) else { return T::default() };
+        serde_json::from_str(&text).unwrap_or_else(|error| {
+            tracing::warn!(path = %path.display(), %error, "left out: cannot be read");
+            T::default()
+        })
+    }
+
+    fn write<T: Serialize>(&self, name: &str, value: &T) {
+        let path = self.folder.join(name);
+        let aside = self.folder.join(format!("{name}.new"));
+        let result = serde_json::to_vec(value).map_err(std::io::Error::other).and_then(|bytes| {
+            let mut file = std::fs::File::create(&aside)?;
+            file.write_all(&bytes)?;
+            file.sync_all()?;
+            std::fs::rename(&aside, &path)
+        });
+        if let Err(error) = result {
+            tracing::warn!(path = %path.display(), %error, "cannot be written; a restart would not know it");
+        }
+    }
+
+    /// The last way back; empty when there is none.
+    #[must_use]
+    pub fn way_back(&self) -> WayBack {
+        self.read("px4-link-return.json")
+    }
+
+    /// Keeps a way back.
+    pub fn keep_way_back(&self, way: &WayBack) {
+        self.write("px4-link-return.json", way);
+    }
+
+    /// What is remembered of the flight.
+    #[must_use]
+    pub fn kept(&self) -> Kept {
+        self.read("px4-link.json")
+    }
+
+    /// Remembers.
+    pub fn keep(&self, kept: &Kept) {
+        self.write("px4-link.json", kept);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_was_kept_is_read_again_and_torn_files_are_left_out() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let store = Store::new(folder.path());
+        assert_eq!(store.kept(), Kept::default());
+        let kept = Kept { ours: true, last_target_id: 9, ..Kept::default() };
+        store.keep(&kept);
+        store.keep_way_back(&WayBack { points: vec![[1.0, 2.0, 3.0, 0.0, -0.5, 1.0]] });
+        assert_eq!((store.kept(), store.way_back().waypoints().len()), (kept, 1));
+        std::fs::write(folder.path().join("px4-link.json"), b"{\"ours\":tr").expect("written");
+        assert_eq!(store.kept(), Kept::default());
+    }
+}

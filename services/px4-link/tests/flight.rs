@@ -1,0 +1,422 @@
+//! Whole flights: the link without sockets against the simulated autopilot, tick by tick.
+
+#![expect(clippy::expect_used, reason = "a test that cannot be set up has failed")]
+
+use std::collections::BTreeMap;
+
+use glam::DVec3;
+use px4_link::commands::set_mode;
+use px4_link::logic::{Core, command_long, setpoint_message};
+use px4_link::mavlink_io::{decode, encode};
+use px4_link::path::{Point, waypoint};
+use px4_link::state::Phase;
+use px4_link::store::Store;
+use px4_link::stream::{Settings, Streamer};
+use shared_types::TICK_NS;
+use shared_types::bus::ReplyAddress;
+use shared_types::config::LinkConfig;
+use shared_types::messages::{
+    CommandReply, CommandRequest, CommandStatus, Commander, FlightMode, TargetStatus, VehicleCommand, VehicleState,
+    VehicleTarget, Waypoint,
+};
+use shared_types::payload::unpack_text;
+use simulator::simulator::{LinkId, Simulator};
+use simulator::vehicle::VehicleConfig;
+
+struct Rig {
+    config: LinkConfig,
+    folder: tempfile::TempDir,
+    simulator: Simulator,
+    core: Core,
+    streamer: Streamer,
+    pending: Vec<Vec<u8>>,
+    now_ns: u64,
+    planner: bool,
+    requests: u64,
+    replies: BTreeMap<u64, CommandReply>,
+    path: Vec<DVec3>,
+}
+
+impl Rig {
+    fn new(config: LinkConfig, vehicle: VehicleConfig) -> Self {
+        let folder = tempfile::tempdir().expect("a folder");
+        Self {
+            core: Core::new(&config, true, 1, Store::new(folder.path())),
+            streamer: Streamer::new(Settings::new(&config)),
+            simulator: Simulator::new(vehicle, 0).expect("good parameters"),
+            config,
+            folder,
+            pending: Vec::new(),
+            now_ns: 0,
+            planner: true,
+            requests: 0,
+            replies: BTreeMap::new(),
+            path: Vec::new(),
+        }
+    }
+
+    /// One tick of 10 ms. Without a link the datagrams are lost.
+    fn tick(&mut self, with_link: bool) {
+        self.now_ns += TICK_NS;
+        for datagram in core::mem::take(&mut self.pending) {
+            self.simulator.receive(LinkId::Onboard, &datagram, 0);
+        }
+        self.simulator.step();
+        let datagrams = self.simulator.take_datagrams();
+        self.path.push(self.simulator.truth().position_m);
+        if !with_link {
+            return;
+        }
+        for received in
+            datagrams.iter().filter(|(link, _)| *link == LinkId::Onboard).flat_map(|(_, bytes)| decode(bytes))
+        {
+            self.core.on_message(self.now_ns, &received);
+        }
+        self.core.on_report(self.streamer.report());
+        if self.planner && self.now_ns.is_multiple_of(100_000_000) {
+            self.core.on_alive(self.now_ns - TICK_NS);
+        }
+        let outputs = self.core.step(self.now_ns);
+        self.pending.extend(outputs.messages.iter().map(|message| encode(1, 0, message)));
+        outputs.orders.into_iter().for_each(|order| self.streamer.order(order));
+        if let Some(to_send) = self.streamer.step(self.now_ns) {
+            self.pending.push(encode(1, 0, &setpoint_message(1, self.now_ns, &to_send)));
+        }
+        self.core.on_report(self.streamer.report());
+        self.replies.extend(outputs.replies.iter().map(|(to, reply)| (to.request_id, *reply)));
+    }
+
+    fn state(&self) -> VehicleState {
+        self.core.state(self.now_ns)
+    }
+
+    /// Ticks until something holds.
+    fn until(&mut self, what: &str, limit_s: u64, holds: impl Fn(&Self) -> bool) {
+        let end_ns = self.now_ns + limit_s * 1_000_000_000;
+        while !holds(self) {
+            assert!(
+                self.now_ns < end_ns,
+                "not within {limit_s} s: {what}; {:?} {:#?}",
+                self.core.phase(),
+                self.state()
+            );
+            self.tick(true);
+        }
+    }
+
+    fn seconds(&mut self, seconds: u64) {
+        (0..seconds * 100).for_each(|_| self.tick(true));
+    }
+
+    fn request(&mut self, command: VehicleCommand) -> u64 {
+        self.requests += 1;
+        let address =
+            ReplyAddress { client: 8, client_incarnation: 0, request_id: self.requests, sent_ns: self.now_ns };
+        self.core.on_command(
+            self.now_ns,
+            address,
+            &CommandRequest { command: command.code(), altitude_m: 2.5, reserved: 0 },
+        );
+        self.requests
+    }
+
+    fn status(&self, id: u64) -> (Option<CommandStatus>, String) {
+        let reply = self.replies.get(&id).copied().unwrap_or_default();
+        (CommandStatus::from_code(reply.status), unpack_text(&reply.reason))
+    }
+
+    fn command(&mut self, command: VehicleCommand, limit_s: u64) {
+        let id = self.request(command);
+        self.until(&format!("{command} confirmed"), limit_s, |rig| rig.status(id).0 == Some(CommandStatus::Confirmed));
+    }
+
+    fn take_off(&mut self) {
+        self.until("ready", 60, |rig| rig.state().ready == 1 && rig.state().armable == 1);
+        self.command(VehicleCommand::Arm, 10);
+        self.command(VehicleCommand::Takeoff, 30);
+        self.command(VehicleCommand::TakeControl, 10);
+        assert_eq!((self.state().mode, self.core.phase()), (FlightMode::Offboard.code(), Phase::Offboard));
+    }
+
+    /// Sends a target whose path begins at the present setpoint and whose way back is the same way.
+    fn target(&mut self, id: u64, points: &[Waypoint]) {
+        let start = Point {
+            position_m: DVec3::from_array(self.state().setpoint_position_m),
+            yaw_rad: self.state().setpoint_yaw_rad,
+            pitch_rad: 0.0,
+        };
+        let mut all = vec![waypoint(&start, 1.0)];
+        all.extend_from_slice(points);
+        let path_len = all.len() as u32;
+        let back: Vec<Waypoint> = all.iter().rev().copied().collect();
+        let return_len = back.len() as u32;
+        all.extend(back);
+        let header = VehicleTarget {
+            id,
+            volume_min_m: [-20.0, -20.0, 0.3],
+            volume_max_m: [20.0, 20.0, 12.0],
+            path_len,
+            return_len,
+        };
+        self.core.on_target(&header, &all);
+    }
+
+    /// px4-link is killed and started again after a while.
+    fn restart(&mut self, away_ticks: u32) {
+        self.pending.clear();
+        (0..away_ticks).for_each(|_| self.tick(false));
+        self.core = Core::new(&self.config, true, 2, Store::new(self.folder.path()));
+        self.streamer = Streamer::new(Settings::new(&self.config));
+    }
+
+    /// The fastest that the vehicle truly was over the last ticks, m/s.
+    fn fastest(&self, ticks: usize) -> f64 {
+        self.path[self.path.len() - ticks..]
+            .windows(2)
+            .map(|pair| pair[0].distance(pair[1]) * 100.0)
+            .fold(0.0, f64::max)
+    }
+}
+
+fn rig() -> Rig {
+    Rig::new(LinkConfig::default(), VehicleConfig::default())
+}
+
+fn at(x: f64, y: f64, z: f64, yaw: f64, pitch: f64) -> Waypoint {
+    waypoint(&Point { position_m: DVec3::new(x, y, z), yaw_rad: yaw, pitch_rad: pitch }, 1.5)
+}
+
+#[test]
+fn a_whole_flight_twice() {
+    let mut rig = rig();
+    for flight in 1..=2u64 {
+        rig.take_off();
+        rig.target(flight * 10, &[at(3.0, 0.0, 2.5, 1.0, -0.4), at(3.0, 3.0, 3.0, -2.5, -0.4)]);
+        rig.until("arrived", 40, |rig| rig.state().target_status == TargetStatus::Arrived.code());
+        // PX4's position loop settles with a time constant of a second.
+        rig.seconds(5);
+        let (state, truth) = (rig.state(), rig.simulator.truth());
+        assert_eq!((state.target_id, state.target_progress), (flight * 10, 1.0));
+        assert!(truth.position_m.distance(DVec3::new(3.0, 3.0, 3.0)) < 0.15, "{}", truth.position_m);
+        assert!(
+            DVec3::from_array(state.position_m).distance(truth.position_m) < 0.02,
+            "the state is the truth, estimator exact"
+        );
+        let axis = glam::DQuat::from_array(state.world_from_gimbal_xyzw) * DVec3::X;
+        assert!((axis - truth.world_from_gimbal * DVec3::X).length() < 0.02, "{axis}");
+        assert!((axis.z.asin() + 0.4).abs() < 0.02 && (axis.y.atan2(axis.x) + 2.5).abs() < 0.05, "{axis}");
+        assert_eq!(state.commander, Commander::Vantage.code());
+        assert!(rig.now_ns - state.position_stamp_ns <= 20_000_000, "stamps are the mission's time");
+        rig.command(VehicleCommand::Return, 90);
+        assert!(rig.simulator.truth().position_m.truncate().length() < 0.4, "home by the way back");
+        assert_eq!((rig.state().armed, rig.state().commander), (0, Commander::Nobody.code()));
+        rig.seconds(3);
+    }
+}
+
+#[test]
+fn the_vehicle_keeps_near_the_path() {
+    let mut rig = rig();
+    rig.take_off();
+    rig.target(1, &[at(3.0, 0.0, 2.5, 0.0, 0.0)]);
+    rig.until("arrived", 40, |rig| rig.state().target_status == TargetStatus::Arrived.code());
+    let arc: Vec<Waypoint> = (1..=40)
+        .map(|i| f64::from(i) * 0.0785)
+        .map(|a| at(3.0 * a.cos(), 3.0 * a.sin(), 2.5, a + core::f64::consts::PI, -0.3))
+        .collect();
+    let begun = rig.path.len();
+    rig.target(2, &arc);
+    rig.until("flown", 60, |rig| {
+        rig.state().target_id == 2 && rig.state().target_status == TargetStatus::Arrived.code()
+    });
+    let worst = rig.path[begun..].iter().map(|at| (at.truncate().length() - 3.0).abs()).fold(0.0, f64::max);
+    eprintln!(
+        "half a circle of 3 m: radial error at most {worst:.3} m, {:.1} s",
+        (rig.path.len() - begun) as f64 * 0.01
+    );
+    assert!(worst < 0.3, "{worst} m");
+}
+
+#[test]
+fn wrong_targets_are_refused_by_name() {
+    let mut rig = rig();
+    rig.take_off();
+    let refused = |rig: &Rig| (rig.state().target_id, TargetStatus::from_code(rig.state().target_status));
+    rig.target(5, &[at(1.0, 0.0, 2.5, 0.0, 0.0)]);
+    rig.until("arrived", 20, |rig| rig.state().target_status == TargetStatus::Arrived.code());
+    rig.target(4, &[at(0.0, 0.0, 2.5, 0.0, 0.0)]);
+    assert_eq!(refused(&rig), (4, Some(TargetStatus::RefusedOld)));
+    rig.target(6, &[at(0.0, 0.0, 99.0, 0.0, 0.0)]);
+    assert_eq!(refused(&rig), (6, Some(TargetStatus::RefusedPath)));
+    rig.target(7, &[at(f64::NAN, 0.0, 2.0, 0.0, 0.0)]);
+    assert_eq!(refused(&rig), (7, Some(TargetStatus::RefusedPath)));
+    let far = VehicleTarget { id: 8, volume_min_m: [-20.0; 3], volume_max_m: [20.0; 3], path_len: 1, return_len: 0 };
+    rig.core.on_target(&far, &[at(1.5, 0.0, 2.5, 0.0, 0.0)]);
+    assert_eq!(refused(&rig), (8, Some(TargetStatus::RefusedStart)));
+    rig.seconds(4);
+    let before = rig.simulator.truth().position_m;
+    rig.seconds(3);
+    assert!(before.distance(rig.simulator.truth().position_m) < 0.05);
+    rig.target(9, &[at(0.0, 0.0, 2.5, 0.0, 0.0)]);
+    assert_eq!(refused(&rig), (9, Some(TargetStatus::Flying)));
+}
+
+#[test]
+fn a_dead_planner_means_hold_then_home_land_and_disarm() {
+    let mut rig = rig();
+    rig.take_off();
+    rig.target(1, &[at(4.0, 0.0, 3.0, 0.0, 0.0), at(4.0, 6.0, 3.0, 0.0, 0.0)]);
+    rig.seconds(4);
+    rig.planner = false;
+    rig.seconds(5);
+    let held = rig.simulator.truth().position_m;
+    assert_eq!(rig.state().target_status, TargetStatus::Held.code());
+    rig.seconds(10);
+    assert!(held.distance(rig.simulator.truth().position_m) < 0.3);
+    rig.until("landed", 120, |rig| rig.state().armed == 0);
+    assert!(rig.simulator.truth().position_m.truncate().length() < 0.4, "{}", rig.simulator.truth().position_m);
+}
+
+#[test]
+fn a_restart_in_the_air_has_no_jump_and_never_replays() {
+    for away in [30, 250] {
+        let mut rig = rig();
+        rig.take_off();
+        rig.target(3, &[at(9.0, 0.0, 3.0, 0.0, 0.0)]);
+        rig.seconds(4);
+        let (requested, address) = (rig.now_ns, 77);
+        rig.restart(away);
+        let lost_at = rig.simulator.truth().position_m;
+        rig.tick(true);
+        rig.core.on_command(
+            rig.now_ns,
+            ReplyAddress { client: 8, client_incarnation: 0, request_id: address, sent_ns: requested },
+            &CommandRequest { command: VehicleCommand::Arm.code(), ..CommandRequest::default() },
+        );
+        rig.until("in control again", 20, |rig| rig.core.phase() == Phase::Offboard && rig.state().streaming == 1);
+        assert_eq!(rig.status(address).0, Some(CommandStatus::Restarted));
+        rig.seconds(5);
+        assert!(
+            rig.simulator.truth().position_m.distance(lost_at) < 2.5,
+            "stayed: {}",
+            rig.simulator.truth().position_m
+        );
+        assert!(rig.fastest(300) < 0.3, "{} m/s", rig.fastest(300));
+        rig.target(3, &[at(9.0, 0.0, 3.0, 0.0, 0.0)]);
+        assert_eq!(rig.state().target_status, TargetStatus::RefusedOld.code());
+        rig.target(4, &[at(9.0, 0.0, 3.0, 0.0, 0.0)]);
+        rig.until("arrived", 30, |rig| {
+            rig.state().target_id == 4 && rig.state().target_status == TargetStatus::Arrived.code()
+        });
+    }
+}
+
+#[test]
+fn a_stall_is_treated_as_a_restart() {
+    for stalled in [70, 300] {
+        let mut rig = rig();
+        rig.take_off();
+        rig.target(1, &[at(9.0, 0.0, 3.0, 0.0, 0.0)]);
+        rig.seconds(3);
+        (0..stalled).for_each(|_| rig.tick(false));
+        rig.seconds(1);
+        rig.until("in control again", 20, |rig| rig.core.phase() == Phase::Offboard && rig.state().target_status == 0);
+        rig.seconds(3);
+        assert!(rig.fastest(200) < 0.3, "{} m/s after {stalled} ticks", rig.fastest(200));
+        assert_eq!(rig.state().commander, Commander::Vantage.code());
+    }
+}
+
+#[test]
+fn a_pilot_who_takes_over_is_left_alone_until_the_word_to_go_on() {
+    let mut rig = rig();
+    rig.take_off();
+    rig.target(1, &[at(9.0, 0.0, 3.0, 0.0, 0.0)]);
+    rig.seconds(2);
+    // AUTO.LAND from a ground station: not our command.
+    let (command, params) = set_mode(FlightMode::Land);
+    rig.simulator.receive(LinkId::Ground, &encode(255, 0, &command_long(1, command, params, 0)), 0);
+    rig.seconds(1);
+    assert_eq!((rig.state().commander, rig.state().streaming), (Commander::Pilot.code(), 0));
+    let refused = rig.request(VehicleCommand::TakeControl);
+    rig.tick(true);
+    assert_eq!(rig.status(refused).0, Some(CommandStatus::Refused));
+    rig.pending.clear();
+    for _ in 0..100 {
+        rig.tick(true);
+        let commands = rig.pending.iter().flat_map(|bytes| decode(bytes));
+        assert!(
+            commands.into_iter().all(|sent| matches!(mavlink::Message::message_id(&sent.message), 0 | 111)),
+            "heartbeats only"
+        );
+    }
+    rig.command(VehicleCommand::GoOn, 10);
+    assert_eq!((rig.state().mode, rig.state().commander), (FlightMode::Hold.code(), Commander::Vantage.code()));
+    rig.command(VehicleCommand::TakeControl, 10);
+}
+
+#[test]
+fn the_world_and_the_vehicle_stay_when_the_estimator_jumps() {
+    let mut rig = rig();
+    rig.take_off();
+    rig.seconds(2);
+    let (before, seen) = (rig.simulator.truth().position_m, DVec3::from_array(rig.state().position_m));
+    rig.simulator.vehicle_mut().reset_estimate(DVec3::new(4.0, -3.0, 1.0));
+    for _ in 0..500 {
+        rig.tick(true);
+        assert!(DVec3::from_array(rig.state().position_m).distance(seen) < 0.3, "the state jumped");
+    }
+    assert_eq!(rig.state().reset_count, 1);
+    assert!(
+        rig.simulator.truth().position_m.distance(before) < 0.3,
+        "the vehicle moved to {}",
+        rig.simulator.truth().position_m
+    );
+}
+
+#[test]
+fn an_autopilot_that_would_climb_away_is_refused_with_the_way_out() {
+    let mut rig = Rig::new(
+        LinkConfig { set_params: Some(false), ..LinkConfig::default() },
+        VehicleConfig { params: vec![("COM_OBL_RC_ACT".to_owned(), 0.0)], ..VehicleConfig::default() },
+    );
+    rig.until("ready", 60, |rig| rig.state().ready == 1 && rig.state().armable == 1);
+    let id = rig.request(VehicleCommand::Arm);
+    rig.tick(true);
+    let (status, reason) = rig.status(id);
+    assert!(status == Some(CommandStatus::Refused) && reason.contains("COM_OBL_RC_ACT"), "{reason}");
+}
+
+#[test]
+fn a_battery_failsafe_is_not_fought() {
+    let mut rig = Rig::new(LinkConfig::default(), VehicleConfig { battery: 0.2, ..VehicleConfig::default() });
+    rig.take_off();
+    for (name, value) in [("SIM_BAT_DRAIN", 60.0), ("SIM_BAT_MIN_PCT", 0.0)] {
+        let message = mavlink::dialects::common::MavMessage::PARAM_SET(mavlink::dialects::common::PARAM_SET_DATA {
+            target_system: 1,
+            target_component: 1,
+            param_id: name.into(),
+            param_value: value,
+            param_type: mavlink::dialects::common::MavParamType::MAV_PARAM_TYPE_REAL32,
+        });
+        rig.simulator.receive(LinkId::Onboard, &encode(1, 0, &message), 0);
+    }
+    rig.until("failsafe", 120, |rig| rig.state().commander == Commander::Failsafe.code());
+    rig.seconds(2);
+    assert_eq!(rig.state().failsafe, shared_types::messages::FailsafeReason::Battery.code());
+    assert_eq!(rig.state().streaming, 0);
+    rig.until("down", 200, |rig| rig.state().armed == 0);
+}
+
+#[test]
+fn leaving_in_the_air_waits_for_the_ground() {
+    let mut rig = rig();
+    rig.take_off();
+    rig.target(1, &[at(3.0, 0.0, 3.0, 0.0, 0.0)]);
+    rig.seconds(6);
+    rig.planner = false;
+    assert!(rig.core.stop(rig.now_ns) && !rig.core.may_leave());
+    rig.until("may leave", 120, |rig| rig.core.may_leave());
+    assert_eq!((rig.state().armed, rig.state().commander), (0, Commander::Nobody.code()));
+    assert!(rig.simulator.truth().position_m.truncate().length() < 0.4);
+}
