@@ -1,0 +1,3 @@
+//! The sources of RGB-D images.
+
+pub mod simulator;
