@@ -1,0 +1,431 @@
+//! A mission's training, from the first keyframe to the last round: pure computing, no clock, no bus.
+//!
+//! The session owns everything that decides what comes next (model, optimiser, voxel grid, view order, losses), so that a
+//! session taken from a checkpoint goes on with the same bits as one that never stopped.
+
+use std::collections::{BTreeMap, VecDeque};
+
+use shared_types::config::{ModelConfig, TrainerConfig};
+use shared_types::messages::GaussianRow;
+use splatting::{Engine, Gaussian, Gaussians, Optimiser, TrainingSettings};
+
+use crate::keyframes::{self, KeyframeError, KeyframeSource, SmallKeyframe, View};
+use crate::logic::clip_box::ClipBox;
+use crate::logic::insertion;
+use crate::logic::order::ViewOrder;
+use crate::logic::prune::{self, DepthView, PruneRules};
+use crate::logic::rounds::{LossHistory, means_learning_rate, window_views};
+use crate::logic::voxels::{VoxelGrid, voxel_edge_m};
+use crate::round::{FinishedRound, Progress, RoundSpec, generation};
+
+/// Training images behind `psnr_train_db`.
+pub(crate) const PSNR_IMAGES: usize = 100;
+/// PSNR of a foreground without error, dB: what 16 bits could show.
+const PSNR_MAX_DB: f64 = 100.0;
+
+/// A round under work.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct ActiveRound {
+    pub(crate) spec: RoundSpec,
+    pub(crate) iterations: u32,
+    pub(crate) order: ViewOrder,
+    pub(crate) losses: LossHistory,
+    pub(crate) psnr_db: VecDeque<f64>,
+}
+
+/// What of a session goes into a checkpoint, besides the model and its optimiser.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct Progression {
+    pub(crate) grid: Option<VoxelGrid>,
+    /// Keyframes whose points were inserted, ascending.
+    pub(crate) inserted: Vec<u64>,
+    pub(crate) next_gaussian_id: u64,
+    pub(crate) total_iterations: u64,
+    pub(crate) finished: Vec<FinishedRound>,
+    pub(crate) active: Option<ActiveRound>,
+}
+
+impl Progression {
+    fn new() -> Self {
+        Self {
+            grid: None,
+            inserted: Vec::new(),
+            next_gaussian_id: 1,
+            total_iterations: 0,
+            finished: Vec::new(),
+            active: None,
+        }
+    }
+}
+
+/// A snapshot of the model, as published.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Snapshot {
+    /// See [`generation`].
+    pub generation: u64,
+    /// Training iterations behind it.
+    pub total_iterations: u64,
+    /// What the round was asked.
+    pub spec: RoundSpec,
+    /// Whether it is the last of its round.
+    pub is_final: bool,
+    /// The Gaussians.
+    pub rows: Vec<GaussianRow>,
+}
+
+/// Training of one mission.
+pub struct Session {
+    config: TrainerConfig,
+    model_config: ModelConfig,
+    engine: Engine,
+    pub(crate) model: Gaussians,
+    pub(crate) optimiser: Optimiser,
+    pub(crate) progression: Progression,
+    /// Keyframes prepared for training, and the clip box that their masks are for.
+    views: BTreeMap<u64, View>,
+    views_clip: Option<ClipBox>,
+}
+
+impl core::fmt::Debug for Session {
+    fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
+        f.debug_struct("Session")
+            .field("gaussians", &self.model.len())
+            .field("total_iterations", &self.progression.total_iterations)
+            .finish_non_exhaustive()
+    }
+}
+
+impl Session {
+    /// A session that has seen nothing.
+    #[must_use]
+    pub fn new(config: TrainerConfig, model_config: ModelConfig, engine: Engine) -> Self {
+        Self {
+            config,
+            model_config,
+            engine,
+            model: Gaussians::new(),
+            optimiser: Optimiser::new(),
+            progression: Progression::new(),
+            views: BTreeMap::new(),
+            views_clip: None,
+        }
+    }
+
+    /// What it was configured with.
+    #[must_use]
+    pub fn config(&self) -> &TrainerConfig {
+        &self.config
+    }
+
+    /// The model as it is.
+    #[must_use]
+    pub fn model(&self) -> &Gaussians {
+        &self.model
+    }
+
+    /// The renderer, for looking at the model.
+    pub fn engine_and_model(&mut self) -> (&mut Engine, &Gaussians) {
+        (&mut self.engine, &self.model)
+    }
+
+    /// Rounds that are over, in their order.
+    #[must_use]
+    pub fn finished(&self) -> &[FinishedRound] {
+        &self.progression.finished
+    }
+
+    /// What the round under work was asked; `None` between rounds.
+    #[must_use]
+    pub fn active(&self) -> Option<&RoundSpec> {
+        self.progression.active.as_ref().map(|round| &round.spec)
+    }
+
+    /// How far the round under work is (the last one, between rounds).
+    #[must_use]
+    pub fn progress(&self) -> Progress {
+        let total_iterations = self.progression.total_iterations;
+        match &self.progression.active {
+            Some(round) => Progress {
+                iterations: round.iterations,
+                total_iterations,
+                gaussians: self.model.len() as u64,
+                loss: round.losses.mean_of_last(),
+                psnr_train_db: round.psnr_db.iter().sum::<f64>() / round.psnr_db.len().max(1) as f64,
+            },
+            None => self.progression.finished.last().map_or_else(Progress::default, |round| round.progress),
+        }
+    }
+
+    /// Begins a round: prunes what is wrong, makes room, and inserts the keyframes that are new.
+    ///
+    /// # Errors
+    /// When a keyframe cannot be read; the session is then as before.
+    pub fn begin(&mut self, spec: RoundSpec, source: &mut dyn KeyframeSource) -> Result<(), KeyframeError> {
+        let clip = self.clip(&spec);
+        let mut fresh = Vec::new();
+        for &id in &spec.keyframes {
+            if !self.progression.inserted.contains(&id) {
+                fresh.push((id, keyframes::load(source, id, &self.model_config)?));
+            }
+        }
+        self.prepare_views(&spec, &fresh, source)?;
+
+        self.prune(&spec);
+        if self.progression.grid.is_none() {
+            let focal = fresh.first().map_or(1.0, |(_, keyframe)| f64::from(keyframe.camera.fx));
+            let edge = if self.config.voxel_m > 0.0 {
+                self.config.voxel_m
+            } else {
+                voxel_edge_m(self.config.voxel_factor, spec.radius_m, spec.box_size_m, focal)
+            };
+            self.progression.grid = Some(VoxelGrid::new(edge as f32));
+        }
+        let mut born: Vec<Gaussian> = Vec::new();
+        if let Some(grid) = &mut self.progression.grid {
+            for (id, keyframe) in &fresh {
+                let first_id = self.progression.next_gaussian_id + born.len() as u64;
+                born.extend(insertion::insert(
+                    &self.config,
+                    &keyframe.camera,
+                    &keyframe.image,
+                    &clip,
+                    grid,
+                    first_id,
+                    spec.round,
+                ));
+                self.progression.inserted.push(*id);
+            }
+        }
+        self.progression.inserted.sort_unstable();
+        self.append(born);
+
+        let window = self.window(&spec).len() as u32;
+        self.progression.active = Some(ActiveRound {
+            iterations: 0,
+            order: ViewOrder::new(spec.seed, window),
+            losses: LossHistory::new(self.config.flat_window),
+            psnr_db: VecDeque::new(),
+            spec,
+        });
+        Ok(())
+    }
+
+    /// Reads what a session taken from a checkpoint needs to go on with its round.
+    ///
+    /// # Errors
+    /// When a keyframe cannot be read.
+    pub fn resume(&mut self, source: &mut dyn KeyframeSource) -> Result<(), KeyframeError> {
+        match self.active().cloned() {
+            Some(spec) => self.prepare_views(&spec, &[], source),
+            None => Ok(()),
+        }
+    }
+
+    /// Trains at most `iterations` more, and tells whether the round is over: at its length, or flat where that ends it.
+    /// `on_iteration` is called after each.
+    pub fn advance(&mut self, iterations: u32, mut on_iteration: impl FnMut()) -> bool {
+        let Some(spec) = self.active().cloned() else { return true };
+        let window = self.window(&spec);
+        for _ in 0..iterations {
+            if self.is_over() || !self.iterate(&spec, &window) {
+                return true;
+            }
+            on_iteration();
+        }
+        self.is_over()
+    }
+
+    /// Ends the round: prunes once more, so that what is scored and kept is clean.
+    pub fn finish(&mut self) -> Option<FinishedRound> {
+        let progress = self.progress();
+        let spec = self.active().cloned()?;
+        self.prune(&spec);
+        self.progression.active = None;
+        let finished = FinishedRound {
+            generation: generation(progress.total_iterations, spec.round, true),
+            progress: Progress { gaussians: self.model.len() as u64, ..progress },
+            spec,
+        };
+        self.progression.finished.push(finished.clone());
+        Some(finished)
+    }
+
+    /// Generation of a snapshot or checkpoint taken now, and whether it is of a round's end; `None` before the first round.
+    #[must_use]
+    pub fn generation_now(&self) -> Option<(u64, bool)> {
+        let is_final = self.active().is_none();
+        let round = self.active().or(self.finished().last().map(|round| &round.spec))?.round;
+        Some((generation(self.progression.total_iterations, round, is_final), is_final))
+    }
+
+    /// The model as it is published: live during a round, final between rounds; `None` before the first.
+    #[must_use]
+    pub fn snapshot(&self) -> Option<Snapshot> {
+        let (generation, is_final) = self.generation_now()?;
+        Some(Snapshot {
+            generation,
+            total_iterations: self.progression.total_iterations,
+            is_final,
+            rows: self.model.iter().map(|gaussian| row(&gaussian)).collect(),
+            spec: self.active().or(self.finished().last().map(|round| &round.spec))?.clone(),
+        })
+    }
+
+    fn is_over(&self) -> bool {
+        self.progression.active.as_ref().is_none_or(|round| {
+            round.iterations >= round.spec.max_iterations
+                || (round.spec.stop_when_flat
+                    && round.iterations.is_multiple_of(self.config.slice_iterations.max(1))
+                    && round.losses.is_flat(self.config.flat_gain))
+        })
+    }
+
+    /// One step; false where there is nothing to train on.
+    fn iterate(&mut self, spec: &RoundSpec, window: &[usize]) -> bool {
+        let settings = self.settings(spec);
+        let Some(round) = &mut self.progression.active else { return false };
+        let view = round
+            .order
+            .next_view()
+            .and_then(|k| window.get(k as usize))
+            .and_then(|&index| spec.keyframes.get(index))
+            .and_then(|id| self.views.get(id));
+        let Some(view) = view else { return false };
+        let terms = self.engine.train_step(&mut self.model, &mut self.optimiser, &view.training, &settings);
+        round.iterations += 1;
+        self.progression.total_iterations += 1;
+        round.losses.push(terms.total);
+        if view.training.foreground_pixels() > 0 {
+            if round.psnr_db.len() == PSNR_IMAGES {
+                round.psnr_db.pop_front();
+            }
+            round.psnr_db.push_back(terms.foreground_psnr_db().min(PSNR_MAX_DB));
+        }
+        true
+    }
+
+    fn settings(&self, spec: &RoundSpec) -> TrainingSettings {
+        let config = &self.config;
+        let edge = self.progression.grid.as_ref().map_or(0.01, VoxelGrid::edge_m);
+        let lr_means = means_learning_rate(
+            self.progression.total_iterations,
+            config.lr_means_start_m,
+            config.lr_means_end_m,
+            config.lr_means_decay_iterations,
+            spec.radius_m,
+        );
+        TrainingSettings {
+            lr_means: lr_means as f32,
+            lr_log_scales: config.lr_log_scales as f32,
+            lr_rotations: config.lr_rotations as f32,
+            lr_opacity: config.lr_opacities as f32,
+            lr_sh: config.lr_sh0 as f32,
+            l1_weight: config.weight_l1 as f32,
+            ssim_weight: config.weight_ssim as f32,
+            depth_weight: config.weight_depth as f32,
+            free_weight: config.weight_free_space as f32,
+            isotropic_weight: config.weight_isotropic as f32,
+            sigma_limits_m: Some((config.sigma_min_voxels as f32 * edge, config.sigma_max_voxels as f32 * edge)),
+            ..TrainingSettings::default()
+        }
+    }
+
+    fn clip(&self, spec: &RoundSpec) -> ClipBox {
+        ClipBox::new(spec.box_center_m, spec.box_size_m, spec.ground_z_m, self.config.ground_margin_m)
+    }
+
+    /// Indices into the round's keyframes that it trains on.
+    fn window(&self, spec: &RoundSpec) -> Vec<usize> {
+        let eyes: Vec<_> =
+            spec.keyframes.iter().filter_map(|id| self.views.get(id)).map(|view| view.eye().as_dvec3()).collect();
+        window_views(&eyes, spec.window)
+    }
+
+    /// Makes sure that every keyframe of the round is prepared, for its clip box; `loaded` ones need not be read.
+    fn prepare_views(
+        &mut self,
+        spec: &RoundSpec,
+        loaded: &[(u64, SmallKeyframe)],
+        source: &mut dyn KeyframeSource,
+    ) -> Result<(), KeyframeError> {
+        let clip = self.clip(spec);
+        if self.views_clip != Some(clip) {
+            self.views.clear();
+            self.views_clip = Some(clip);
+        }
+        for &id in &spec.keyframes {
+            if !self.views.contains_key(&id) {
+                let keyframe = match loaded.iter().find(|(other, _)| *other == id) {
+                    Some((_, keyframe)) => keyframe.clone(),
+                    None => keyframes::load(source, id, &self.model_config)?,
+                };
+                self.views.insert(id, View::new(id, keyframe, &self.config, &clip)?);
+            }
+        }
+        Ok(())
+    }
+
+    fn prune(&mut self, spec: &RoundSpec) {
+        let edge = self.progression.grid.as_ref().map_or(0.0, VoxelGrid::edge_m);
+        let rules = PruneRules {
+            clip: self.clip(spec),
+            min_opacity: self.config.prune_opacity as f32,
+            // A hair above the clamp, which rounds.
+            max_sigma_m: self.config.sigma_max_voxels as f32 * edge * 1.001,
+            front_m: self.config.prune_front_voxels as f32 * edge + 3.0 * self.config.depth_sigma_m as f32,
+            front_views: self.config.prune_front_views,
+        };
+        let views: Vec<DepthView<'_>> = spec
+            .keyframes
+            .iter()
+            .filter_map(|id| self.views.get(id))
+            .map(|view| DepthView { camera: &view.camera, depth_m: &view.depth_m })
+            .collect();
+        let kept = prune::keep(&self.model, &views, &rules);
+        self.retain(&kept);
+    }
+
+    fn retain(&mut self, kept: &[bool]) {
+        self.optimiser.resize(self.model.len());
+        self.model.retain(|i| kept.get(i).copied().unwrap_or(false));
+        self.optimiser.retain(|i| kept.get(i).copied().unwrap_or(false));
+    }
+
+    /// Adds newborn Gaussians, making room at the cap, and brings neighbours together in memory.
+    fn append(&mut self, mut born: Vec<Gaussian>) {
+        let cap = self.model_config.max_gaussians as usize;
+        born.truncate(cap);
+        let kept = prune::keep_most_contributing(&self.model, cap - born.len());
+        self.retain(&kept);
+        self.progression.next_gaussian_id += born.len() as u64;
+        self.model.extend(born);
+        self.optimiser.resize(self.model.len());
+        let order = self.model.morton_order();
+        self.model.permute(&order);
+        self.optimiser.permute(&order);
+    }
+
+    pub(crate) fn reset(&mut self) {
+        self.restore(Gaussians::new(), Optimiser::new(), Progression::new());
+    }
+
+    pub(crate) fn restore(&mut self, model: Gaussians, optimiser: Optimiser, progression: Progression) {
+        (self.model, self.optimiser, self.progression) = (model, optimiser, progression);
+    }
+}
+
+/// A Gaussian as on channels: its rotation has unit length there.
+#[must_use]
+pub fn row(gaussian: &Gaussian) -> GaussianRow {
+    let rotation = gaussian.rotation.normalize();
+    GaussianRow {
+        mean_m: gaussian.mean.to_array(),
+        log_scales: gaussian.log_scales.to_array(),
+        rotation_xyzw: rotation.to_array(),
+        opacity_logit: gaussian.opacity_logit,
+        sh0: gaussian.sh,
+        id: [gaussian.id as u32, (gaussian.id >> 32) as u32],
+        birth_round: gaussian.birth_round,
+        reserved: 0,
+    }
+}

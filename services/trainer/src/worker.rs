@@ -1,0 +1,334 @@
+//! The training thread: takes rounds, computes them slice by slice, writes checkpoints and models, hands results over.
+//!
+//! The service's loop must answer every tick, so it never computes. In lockstep everything that the thread does depends on
+//! iteration counts alone ([`Pace::Counted`]); how fast it is decides only how long a due tick has to wait.
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, TryRecvError, sync_channel};
+use std::thread::JoinHandle;
+use std::time::{Duration, Instant};
+
+use shared_types::folder::write_atomic;
+
+use crate::checkpoint;
+use crate::keyframes::KeyframeSource;
+use crate::round::{FinishedRound, Progress, RoundSpec};
+use crate::session::{Session, Snapshot};
+
+/// Results that may wait to be published: bounds how far the thread runs ahead of the mission clock, and its memory.
+const AHEAD: usize = 8;
+
+/// When snapshots and checkpoints are taken within a round.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Pace {
+    /// Each time so many iterations have passed: lockstep.
+    Counted {
+        /// Iterations between snapshots.
+        snapshot_every: f64,
+        /// Iterations between checkpoints.
+        checkpoint_every: f64,
+    },
+    /// When the service asks for one: wall mode.
+    OnDemand,
+}
+
+/// What the thread hands over.
+#[derive(Debug)]
+pub enum Output {
+    /// It has looked at the mission folder.
+    Ready {
+        /// Rounds that are over.
+        finished: Vec<FinishedRound>,
+        /// Iterations of the round that was cut off, and what it was asked.
+        active: Option<(RoundSpec, u32)>,
+        /// The model at the end of the last round.
+        snapshot: Option<Snapshot>,
+    },
+    /// A slice is computed.
+    Slice {
+        /// How far the round is.
+        progress: Progress,
+        /// Whether it was the last.
+        over: bool,
+        /// The model, when one is due.
+        snapshot: Option<Snapshot>,
+    },
+    /// A round is over and on disk.
+    Finished {
+        /// How it ended.
+        round: FinishedRound,
+        /// The model.
+        snapshot: Snapshot,
+    },
+    /// A round cannot be run.
+    Failed {
+        /// Which.
+        round: u32,
+        /// Why.
+        reason: String,
+    },
+    /// The thread was asked to stop and has written what it had.
+    Stopped,
+}
+
+/// Signals between the service and its thread.
+#[derive(Debug, Default)]
+struct Signals {
+    stop: AtomicBool,
+    snapshot: AtomicBool,
+    checkpoint: AtomicBool,
+    work: AtomicU64,
+}
+
+/// The service's end.
+#[derive(Debug)]
+pub struct Worker {
+    jobs: Option<SyncSender<RoundSpec>>,
+    outputs: Receiver<Output>,
+    signals: Arc<Signals>,
+    thread: Option<JoinHandle<()>>,
+}
+
+/// The thread is gone: it panicked.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+#[error(
+    "the training thread ended unexpectedly; its last words are in the log, and a restart goes on from the newest checkpoint"
+)]
+pub struct WorkerGone;
+
+impl Worker {
+    /// Starts the thread on what `model_folder` (the mission's `model/`) holds.
+    ///
+    /// # Errors
+    /// When the system refuses a thread.
+    pub fn start(
+        session: Session,
+        source: Box<dyn KeyframeSource>,
+        model_folder: PathBuf,
+        slice_iterations: u32,
+        pace: Pace,
+    ) -> std::io::Result<Self> {
+        let (jobs, job_receiver) = sync_channel(1);
+        let (output_sender, outputs) = sync_channel(AHEAD);
+        let signals = Arc::new(Signals::default());
+        let mut thread = Thread {
+            session,
+            source,
+            model_folder,
+            slice_iterations: slice_iterations.max(1),
+            pace,
+            outputs: output_sender,
+            signals: Arc::clone(&signals),
+        };
+        let handle = std::thread::Builder::new().name("train".to_owned()).spawn(move || thread.run(&job_receiver))?;
+        Ok(Self { jobs: Some(jobs), outputs, signals, thread: Some(handle) })
+    }
+
+    /// Gives it a round. It must be idle.
+    ///
+    /// # Errors
+    /// When it is gone.
+    pub fn begin(&self, spec: RoundSpec) -> Result<(), WorkerGone> {
+        let sent = self.jobs.as_ref().is_some_and(|jobs| jobs.send(spec).is_ok());
+        if sent { Ok(()) } else { Err(WorkerGone) }
+    }
+
+    /// The next result, if there is one.
+    ///
+    /// # Errors
+    /// When it is gone.
+    pub fn poll(&self) -> Result<Option<Output>, WorkerGone> {
+        match self.outputs.try_recv() {
+            Ok(output) => Ok(Some(output)),
+            Err(TryRecvError::Empty) => Ok(None),
+            Err(TryRecvError::Disconnected) => Err(WorkerGone),
+        }
+    }
+
+    /// Asks for a snapshot with the next slice ([`Pace::OnDemand`]).
+    pub fn ask_snapshot(&self) {
+        self.signals.snapshot.store(true, Ordering::Relaxed);
+    }
+
+    /// Asks for a checkpoint after the next slice ([`Pace::OnDemand`]).
+    pub fn ask_checkpoint(&self) {
+        self.signals.checkpoint.store(true, Ordering::Relaxed);
+    }
+
+    /// Counts real progress.
+    #[must_use]
+    pub fn work(&self) -> u64 {
+        self.signals.work.load(Ordering::Relaxed)
+    }
+
+    /// Stops it after the present slice and a checkpoint; waits for that at most `patience`. True when it stopped in time.
+    pub fn stop(&mut self, patience: Duration) -> bool {
+        self.signals.stop.store(true, Ordering::Relaxed);
+        self.jobs = None;
+        let deadline = Instant::now() + patience;
+        loop {
+            match self.outputs.recv_timeout(deadline.saturating_duration_since(Instant::now())) {
+                Ok(Output::Stopped) | Err(RecvTimeoutError::Disconnected) => break,
+                Ok(_) => {}
+                Err(RecvTimeoutError::Timeout) => return false,
+            }
+        }
+        self.thread.take().is_none_or(|thread| thread.join().is_ok())
+    }
+}
+
+/// The service has gone; nobody waits for results.
+struct Unwanted;
+
+struct Thread {
+    session: Session,
+    source: Box<dyn KeyframeSource>,
+    model_folder: PathBuf,
+    slice_iterations: u32,
+    pace: Pace,
+    outputs: SyncSender<Output>,
+    signals: Arc<Signals>,
+}
+
+impl Thread {
+    fn run(&mut self, jobs: &Receiver<RoundSpec>) {
+        let ready = self.look_at_folder();
+        let mut alive = self.send(ready).is_ok();
+        while alive && let Ok(spec) = jobs.recv() {
+            alive = self.round(spec).is_ok();
+        }
+        // Nobody may be left to hear it.
+        self.outputs.send(Output::Stopped).ok();
+    }
+
+    fn send(&self, output: Output) -> Result<(), Unwanted> {
+        self.outputs.send(output).map_err(|_gone| Unwanted)
+    }
+
+    fn look_at_folder(&mut self) -> Output {
+        let mut snapshot = None;
+        if let Some(last_final) = checkpoint::newest(&self.model_folder, true) {
+            last_final.restore_into(&mut self.session);
+            snapshot = self.session.snapshot();
+        }
+        if let Some(newest) = checkpoint::newest(&self.model_folder, false) {
+            newest.restore_into(&mut self.session);
+            tracing::info!(
+                iterations = self.session.progress().total_iterations,
+                rounds = self.session.finished().len(),
+                within_round = self.session.active().is_some(),
+                "going on from a checkpoint"
+            );
+        }
+        Output::Ready {
+            finished: self.session.finished().to_vec(),
+            active: self.session.active().cloned().map(|spec| (spec, self.session.progress().iterations)),
+            snapshot,
+        }
+    }
+
+    fn round(&mut self, spec: RoundSpec) -> Result<(), Unwanted> {
+        let round = spec.round;
+        let done_before = self.session.active().is_none()
+            && self.session.finished().last().is_some_and(|finished| finished.spec == spec);
+        if !done_before {
+            if let Err(error) = self.begin(spec) {
+                return self.send(Output::Failed { round, reason: error.to_string() });
+            }
+            self.signals.work.fetch_add(1, Ordering::Relaxed);
+            if !self.train()? {
+                return Err(Unwanted);
+            }
+            self.session.finish();
+        }
+        // On disk before anybody hears of it.
+        if let Err(error) = checkpoint::write(&self.model_folder, &self.session) {
+            return self.send(Output::Failed { round, reason: error.to_string() });
+        }
+        if let Err(error) = write_models(&self.model_folder, &self.session, round) {
+            tracing::warn!(error, "cannot write the model of a round; its checkpoint is written");
+        }
+        match (self.session.finished().last().cloned(), self.session.snapshot()) {
+            (Some(round), Some(snapshot)) => self.send(Output::Finished { round, snapshot }),
+            _ => self.send(Output::Failed { round, reason: "the round left no result".to_owned() }),
+        }
+    }
+
+    fn begin(&mut self, spec: RoundSpec) -> Result<(), crate::keyframes::KeyframeError> {
+        match self.session.active() {
+            Some(active) if *active == spec => return self.session.resume(&mut *self.source),
+            Some(_) => {
+                tracing::warn!(
+                    round = spec.round,
+                    "the round of the newest checkpoint is not wanted any more; starting from the last round's end"
+                );
+                checkpoint::remove_live(&self.model_folder);
+                match checkpoint::newest(&self.model_folder, true) {
+                    Some(last_final) => last_final.restore_into(&mut self.session),
+                    None => self.session.reset(),
+                }
+            }
+            None => {}
+        }
+        self.session.begin(spec, &mut *self.source)
+    }
+
+    /// Trains to the round's end; false when it was asked to stop before.
+    fn train(&mut self) -> Result<bool, Unwanted> {
+        loop {
+            let before = self.session.progress().iterations;
+            let work = &self.signals.work;
+            let over = self.session.advance(self.slice_iterations, || {
+                work.fetch_add(1, Ordering::Relaxed);
+            });
+            let progress = self.session.progress();
+            if !over && self.is_due(before, progress.iterations, false) {
+                self.checkpoint();
+            }
+            if self.signals.stop.load(Ordering::Relaxed) {
+                self.checkpoint();
+                return Ok(false);
+            }
+            if progress.iterations == before {
+                return Ok(true);
+            }
+            let wanted = !over && self.is_due(before, progress.iterations, true);
+            let snapshot = if wanted { self.session.snapshot() } else { None };
+            self.send(Output::Slice { progress, over, snapshot })?;
+            if over {
+                return Ok(true);
+            }
+        }
+    }
+
+    fn is_due(&self, before: u32, now: u32, snapshot: bool) -> bool {
+        match self.pace {
+            Pace::Counted { snapshot_every, checkpoint_every } => {
+                let every = if snapshot { snapshot_every } else { checkpoint_every }.max(1.0);
+                (f64::from(before) / every).floor() < (f64::from(now) / every).floor()
+            }
+            Pace::OnDemand => {
+                let asked = if snapshot { &self.signals.snapshot } else { &self.signals.checkpoint };
+                asked.swap(false, Ordering::Relaxed)
+            }
+        }
+    }
+
+    fn checkpoint(&self) {
+        if let Err(error) = checkpoint::write(&self.model_folder, &self.session) {
+            tracing::warn!(%error, "cannot write a checkpoint; training goes on");
+        }
+    }
+}
+
+/// Writes `rounds/07.ply` and `model.ply`.
+fn write_models(folder: &Path, session: &Session, round: u32) -> Result<(), String> {
+    let mut ply = Vec::new();
+    splatting::ply::write(session.model(), &mut ply).map_err(|error| error.to_string())?;
+    for path in [folder.join("rounds").join(format!("{round:02}.ply")), folder.join("model.ply")] {
+        write_atomic(&path, &ply).map_err(|error| error.to_string())?;
+    }
+    Ok(())
+}
