@@ -1,0 +1,219 @@
+//! Whole missions, with and without faults.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use glam::DVec3;
+use shared_types::config::PlannerConfig;
+use shared_types::config::planner::{MissionMode, SelectorName, Strategy};
+use shared_types::messages::{EndReason, MissionCommand, MissionPhase};
+
+use crate::journal::Record;
+use crate::simulated::{Faults, World, setup};
+use crate::testing::Scene;
+
+fn rock() -> Scene {
+    Scene::single(0.2, -0.3, DVec3::new(1.5, 1.1, 1.0))
+}
+
+fn fly(planner: PlannerConfig, faults: Faults) -> (World, EndReason) {
+    let mut world = World::new(setup(planner, 7), rock(), faults);
+    let end = world.fly(2000.0);
+    (world, end)
+}
+
+fn short() -> PlannerConfig {
+    PlannerConfig { keyframes: 14, ..PlannerConfig::default() }
+}
+
+#[test]
+fn the_default_mission_takes_48_keyframes_and_lands() {
+    let (world, end) = fly(PlannerConfig::default(), Faults::default());
+    assert_eq!((end, world.keyframes()), (EndReason::Complete, 48));
+    assert!(world.captures.values().all(|&count| count == 1));
+    assert_eq!(world.state.unwrap().phase, MissionPhase::Done.code());
+    let rounds: Vec<u32> = world
+        .journal
+        .iter()
+        .filter_map(|entry| if let Record::Round { views, .. } = entry.record { Some(views) } else { None })
+        .collect();
+    assert_eq!(rounds, (1..=12).map(|round| 4 * round).collect::<Vec<_>>());
+    assert!(world.least_clearance_m >= 0.72, "{}", world.least_clearance_m);
+    assert!(world.state.unwrap().paper_coverage > 0.5, "{}", world.state.unwrap().paper_coverage);
+    println!("default: {:.1} s, {:.1} m", world.seconds(), world.state.unwrap().path_m);
+    assert!(world.seconds() < 300.0, "{}", world.seconds());
+}
+
+#[test]
+fn the_papers_mission_takes_48_keyframes_in_the_order_of_algorithm_1() {
+    let (world, end) = fly(PlannerConfig::paper(), Faults::default());
+    assert_eq!((end, world.keyframes()), (EndReason::Complete, 48));
+    println!("paper: {:.1} s, {:.1} m", world.seconds(), world.state.unwrap().path_m);
+    // Serial: a round is over before the next batch is scored, and nothing flies meanwhile.
+    let mut last = "";
+    for entry in &world.journal {
+        let step = match &entry.record {
+            Record::Round { .. } => "train",
+            Record::RoundDone { .. } => "trained",
+            Record::Score { .. } => "score",
+            Record::Selected { .. } => "selected",
+            Record::Captured { .. } => "captured",
+            _ => continue,
+        };
+        let allowed = match step {
+            "train" => last == "captured",
+            "trained" => last == "train",
+            "score" => last == "trained",
+            "selected" => last == "score" || last == "captured",
+            _ => ["selected", "captured", ""].contains(&last),
+        };
+        assert!(allowed, "{step} after {last}");
+        last = step;
+    }
+    let total: u32 = world
+        .journal
+        .iter()
+        .filter_map(
+            |entry| if let Record::Round { max_iterations, .. } = entry.record { Some(max_iterations) } else { None },
+        )
+        .sum();
+    assert_eq!(total, 750 + (2..=12).map(|k| (50 * 4 * k).clamp(750, 2500)).sum::<u32>());
+}
+
+#[test]
+fn every_strategy_and_selector_completes() {
+    for (strategy, selector, wanted) in [
+        (Strategy::Orbit24, SelectorName::DepthVariance, 24),
+        (Strategy::OrbitLookAt, SelectorName::DepthVariance, 24),
+        (Strategy::Nbv, SelectorName::AngleOnly, 14),
+        (Strategy::Nbv, SelectorName::FibonacciOrder, 14),
+        (Strategy::Nbv, SelectorName::Random, 14),
+        (Strategy::Nbv, SelectorName::UncertaintyOnly, 14),
+    ] {
+        let keyframes = if strategy == Strategy::Nbv { 14 } else { 48 };
+        let (world, end) = fly(PlannerConfig { strategy, selector, keyframes, ..short() }, Faults::default());
+        assert_eq!((end, world.keyframes()), (EndReason::Complete, wanted), "{strategy:?} {selector:?}");
+        assert!(world.least_clearance_m >= 0.72);
+    }
+}
+
+#[test]
+fn the_same_seed_writes_the_same_journal() {
+    let (a, _) = fly(short(), Faults::default());
+    let (b, _) = fly(short(), Faults::default());
+    assert_eq!(a.journal, b.journal);
+}
+
+#[test]
+fn failed_captures_are_tried_again() {
+    let (world, end) = fly(short(), Faults { failing_capture: 5, ..Faults::default() });
+    assert_eq!((end, world.keyframes()), (EndReason::Complete, 14));
+    assert!(world.journal.iter().any(|entry| matches!(entry.record, Record::CaptureFailed { .. })));
+}
+
+#[test]
+fn a_low_battery_brings_the_vehicle_home_and_trains_what_there_is() {
+    let (world, end) = fly(short(), Faults { drain_per_s: 0.012, ..Faults::default() });
+    assert_eq!(end, EndReason::Battery);
+    let taken = world.keyframes();
+    assert!(taken > 4 && taken < 14, "{taken}");
+    let views = world.journal.iter().rev().find_map(|entry| match entry.record {
+        Record::Round { views, .. } => Some(views as usize),
+        _ => None,
+    });
+    assert_eq!(views, Some(taken), "the last round trains on everything");
+    assert_eq!(world.state.unwrap().phase, MissionPhase::Done.code());
+}
+
+#[test]
+fn bare_ground_is_scanned_and_then_said_to_be_bare() {
+    let mut world = World::new(setup(short(), 1), Scene::default(), Faults::default());
+    assert_eq!(world.fly(600.0), EndReason::NoObject);
+    assert_eq!(world.state.unwrap().phase, MissionPhase::Failed.code());
+    let scans = world
+        .journal
+        .iter()
+        .filter(|entry| matches!(&entry.record, Record::Target { purpose, .. } if purpose == "scan"));
+    assert_eq!(scans.count(), 8);
+}
+
+#[test]
+fn an_object_beside_the_survey_point_is_found_by_the_scan() {
+    let scene = Scene::single(4.0, 2.5, DVec3::new(1.2, 1.2, 1.0));
+    let mut world = World::new(setup(short(), 1), scene, Faults::default());
+    assert_eq!(world.fly(900.0), EndReason::Complete);
+    let state = world.state.unwrap();
+    assert!(
+        (DVec3::from_array(state.box_center_m) - DVec3::new(4.0, 2.5, 0.5)).length() < 0.2,
+        "{:?}",
+        state.box_center_m
+    );
+    assert_eq!(world.keyframes(), 14);
+}
+
+#[test]
+fn the_operator_can_stop_land_hold_and_go_on() {
+    for (command, at) in [(MissionCommand::Stop, 6000), (MissionCommand::Land, 6000), (MissionCommand::Stop, 100)] {
+        let faults = Faults { commands: BTreeMap::from([(at, command)]), ..Faults::default() };
+        assert_eq!(fly(short(), faults).1, EndReason::Operator, "{command}");
+    }
+    let commands = BTreeMap::from([(6000, MissionCommand::Abort), (7000, MissionCommand::GoOn)]);
+    let (world, end) = fly(short(), Faults { commands, ..Faults::default() });
+    assert_eq!((end, world.keyframes()), (EndReason::Complete, 14));
+}
+
+#[test]
+fn a_pilot_is_waited_for() {
+    let (world, end) = fly(short(), Faults { pilot: Some(5000), ..Faults::default() });
+    assert_eq!((end, world.keyframes()), (EndReason::Complete, 14));
+    assert!(world.journal.iter().any(|entry| entry.record == Record::Suspended));
+}
+
+#[test]
+fn the_time_limit_nothing_to_gain_and_a_lost_snapshot() {
+    let (_, end) = fly(PlannerConfig { max_mission_s: 60.0, ..short() }, Faults::default());
+    assert_eq!(end, EndReason::Time);
+    let (world, end) = fly(PlannerConfig { stop_gain: 0.4, ..PlannerConfig::default() }, Faults::default());
+    assert_eq!(end, EndReason::NothingToGain);
+    assert!(world.keyframes() < 48);
+    let (world, end) = fly(short(), Faults { generation_gone: true, ..Faults::default() });
+    assert_eq!((end, world.keyframes()), (EndReason::Complete, 14));
+}
+
+#[test]
+fn an_obstacle_beside_the_object_is_flown_around() {
+    let (world, end) = fly(short(), Faults { wall: true, ..Faults::default() });
+    assert_eq!((end, world.keyframes()), (EndReason::Complete, 14));
+}
+
+#[test]
+fn a_mission_that_is_over_stays_over() {
+    let (world, _) = fly(short(), Faults::default());
+    let mission = crate::mission::Mission::new(world.setup.clone(), &world.journal);
+    assert!(mission.is_over());
+}
+
+proptest::proptest! {
+    #![proptest_config(proptest::test_runner::Config::with_cases(5))]
+    #[test]
+    fn after_deaths_every_keyframe_exists_once_and_the_choice_is_the_same(
+        deaths in proptest::collection::btree_map(50u64..13_000, 1u64..400, 1..5),
+        link in proptest::collection::btree_set(1500u64..13_000, 0..3),
+        serial in proptest::bool::ANY,
+    ) {
+        let mode = if serial { MissionMode::Serial } else { MissionMode::Concurrent };
+        let planner = PlannerConfig { mode, ..short() };
+        let (calm, _) = fly(planner.clone(), Faults::default());
+        let faults = Faults { restarts: deaths, link_restarts: link, ..Faults::default() };
+        let (world, end) = fly(planner, faults);
+        proptest::prop_assert_eq!(end, EndReason::Complete);
+        proptest::prop_assert_eq!(world.keyframes(), 14);
+        proptest::prop_assert!(world.captures.values().all(|&count| count == 1));
+        proptest::prop_assert_eq!(world.selections(), calm.selections());
+        proptest::prop_assert!(world.least_clearance_m >= 0.72);
+        let ids: BTreeSet<u64> = world.journal.iter().filter_map(|entry| match &entry.record {
+            Record::Captured { keyframe_id, .. } => Some(*keyframe_id),
+            _ => None,
+        }).collect();
+        proptest::prop_assert_eq!(ids.len(), 14 + 2);
+    }
+}
