@@ -1,0 +1,272 @@
+//! The command line.
+
+use std::path::PathBuf;
+
+use clap::{Args, Parser, Subcommand, ValueEnum};
+use shared_types::ServiceName;
+
+/// Flies a quadcopter around an object and reconstructs it with 3D Gaussian Splatting on the way.
+#[derive(Debug, Parser)]
+#[command(name = "vantage", version, max_term_width = 100)]
+#[command(after_help = "Example: vantage fly --preset quick --output rock\n\
+    Exit codes: 0 success, 1 mission or job failed, 64 bad arguments or configuration, 69 something needed is missing, \
+    70 internal error.")]
+pub struct Cli {
+    /// What to do.
+    #[command(subcommand)]
+    pub command: Command,
+}
+
+/// The subcommands.
+#[derive(Debug, Subcommand)]
+pub enum Command {
+    /// Fly a whole mission on the embedded simulator, or on a vehicle by its configuration.
+    #[command(after_help = "Example: vantage fly --object statue.obj --preset quick --output statue --seed 7")]
+    Fly(Fly),
+    /// Go on with a mission that was cut off.
+    #[command(after_help = "Example: vantage resume missions/20260801-120000-0")]
+    Resume(Resume),
+    /// Show what runs, since when, restarts, memory and ages of the last messages.
+    #[command(after_help = "Example: vantage status --json")]
+    Status(Status),
+    /// Check this machine and say what to do about what is found.
+    #[command(after_help = "Example: vantage doctor --clean")]
+    Doctor(Doctor),
+    /// Measure a mission's model against held-out views and the true surface.
+    #[command(after_help = "Example: vantage evaluate missions/20260801-120000-0 --json")]
+    Evaluate(Evaluate),
+    /// Write a mission's model or views for other people's tools.
+    #[command(after_help = "Example: vantage export missions/20260801-120000-0 --format colmap --output colmap")]
+    Export(Export),
+    /// Print a configuration file with every key, its default and what it means.
+    #[command(after_help = "Example: vantage config --preset quick > mission.toml")]
+    Config(Configure),
+    /// One process of a mission in the foreground.
+    #[command(flatten)]
+    Process(Process),
+}
+
+/// The services, one process each.
+#[derive(Debug, Subcommand)]
+pub enum Process {
+    /// MAVLink: vehicle state and setpoints.
+    #[command(after_help = "Example: vantage px4-link --system lab")]
+    Px4Link(Service),
+    /// RGB-D images and keyframes.
+    #[command(after_help = "Example: vantage camera --system lab")]
+    Camera(Service),
+    /// The Gaussian model.
+    #[command(after_help = "Example: vantage trainer --system lab")]
+    Trainer(Service),
+    /// Scores of candidate views.
+    #[command(after_help = "Example: vantage scorer --system lab")]
+    Scorer(Service),
+    /// The mission.
+    #[command(after_help = "Example: vantage planner --system lab")]
+    Planner(Service),
+    /// Holds the channels open and cleans up after the dead.
+    #[command(after_help = "Example: vantage keeper --system lab")]
+    Keeper(Service),
+    /// A PX4-compatible vehicle and the mission clock.
+    #[command(after_help = "Example: vantage simulator --system lab")]
+    Simulator(Service),
+    /// The simulator's rendered world.
+    #[command(after_help = "Example: vantage world --system lab")]
+    World(Service),
+}
+
+impl Process {
+    /// The service and its arguments.
+    #[must_use]
+    pub fn service(&self) -> (ServiceName, &Service) {
+        match self {
+            Self::Px4Link(service) => (ServiceName::Px4Link, service),
+            Self::Camera(service) => (ServiceName::Camera, service),
+            Self::Trainer(service) => (ServiceName::Trainer, service),
+            Self::Scorer(service) => (ServiceName::Scorer, service),
+            Self::Planner(service) => (ServiceName::Planner, service),
+            Self::Keeper(service) => (ServiceName::Keeper, service),
+            Self::Simulator(service) => (ServiceName::Simulator, service),
+            Self::World(service) => (ServiceName::World, service),
+        }
+    }
+}
+
+/// Where a configuration comes from: defaults < preset < file < `--set`.
+#[derive(Debug, Clone, Default, Args)]
+pub struct Settings {
+    /// Configuration file (TOML), laid over the preset; `vantage config` prints one.
+    #[arg(long, value_name = "FILE")]
+    pub config: Option<PathBuf>,
+    /// Preset that the configuration starts from: default, paper, quick or tiny.
+    #[arg(long, default_value = "default", value_name = "NAME")]
+    pub preset: String,
+    /// One key, laid over everything else; may be given many times.
+    #[arg(long = "set", value_name = "SECTION.KEY=VALUE")]
+    pub sets: Vec<String>,
+}
+
+/// Arguments of `fly`.
+#[derive(Debug, Clone, Args)]
+pub struct Fly {
+    /// Configuration.
+    #[command(flatten)]
+    pub settings: Settings,
+    /// Mesh of the object (OBJ, PLY, STL or glTF); none: a procedural rock.
+    #[arg(long, value_name = "MESH")]
+    pub object: Option<PathBuf>,
+    /// Mission folder to make; must not hold a mission. Default: missions/<date>-<seed>.
+    #[arg(long, value_name = "DIR")]
+    pub output: Option<PathBuf>,
+    /// Seed of everything random.
+    #[arg(long, value_name = "N")]
+    pub seed: Option<u64>,
+    /// Simulated seconds per wall second at most; 0: no limit.
+    #[arg(long, value_name = "X", allow_negative_numbers = true)]
+    pub speed: Option<f64>,
+    /// Name of the system; default: a fresh one.
+    #[arg(long, value_name = "NAME")]
+    pub system: Option<String>,
+    /// Print the result as JSON (report/metrics.json) instead of a table.
+    #[arg(long)]
+    pub json: bool,
+}
+
+/// Arguments of `resume`.
+#[derive(Debug, Clone, Args)]
+pub struct Resume {
+    /// The mission folder.
+    pub folder: PathBuf,
+    /// Simulated seconds per wall second at most; 0: no limit.
+    #[arg(long, value_name = "X", allow_negative_numbers = true)]
+    pub speed: Option<f64>,
+    /// Print the result as JSON (report/metrics.json) instead of a table.
+    #[arg(long)]
+    pub json: bool,
+}
+
+/// Arguments of `status`.
+#[derive(Debug, Clone, Args)]
+pub struct Status {
+    /// Name or folder of the system; default: the only one there is.
+    #[arg(long, value_name = "NAME")]
+    pub system: Option<String>,
+    /// As JSON.
+    #[arg(long)]
+    pub json: bool,
+}
+
+/// Arguments of `doctor`.
+#[derive(Debug, Clone, Args)]
+pub struct Doctor {
+    /// Configuration whose ports and sizes are checked.
+    #[command(flatten)]
+    pub settings: Settings,
+    /// Remove what dead systems left behind.
+    #[arg(long)]
+    pub clean: bool,
+    /// As JSON.
+    #[arg(long)]
+    pub json: bool,
+}
+
+/// Arguments of `evaluate`.
+#[derive(Debug, Clone, Args)]
+pub struct Evaluate {
+    /// The mission folder.
+    pub folder: PathBuf,
+    /// Held-out views per radius, at most 100; default: launch.evaluate_views.
+    #[arg(long, value_name = "N")]
+    pub views: Option<u32>,
+    /// Width of the held-out views, pixels (4:3); default: launch.evaluate_width.
+    #[arg(long, value_name = "PIXELS")]
+    pub width: Option<u32>,
+    /// Model to measure instead of the mission's own (INRIA PLY).
+    #[arg(long, value_name = "PLY")]
+    pub model: Option<PathBuf>,
+    /// Print metrics.json instead of a table.
+    #[arg(long)]
+    pub json: bool,
+}
+
+/// Arguments of `export`.
+#[derive(Debug, Clone, Args)]
+pub struct Export {
+    /// The mission folder.
+    pub folder: PathBuf,
+    /// What to write.
+    #[arg(long, value_enum)]
+    pub format: Format,
+    /// Where to; default: <folder>/export/<format>.
+    #[arg(long, value_name = "PATH")]
+    pub output: Option<PathBuf>,
+}
+
+/// Formats of other people's tools.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum Format {
+    /// The model as an INRIA PLY, which every splat viewer reads.
+    Ply,
+    /// The views as a COLMAP text model.
+    Colmap,
+    /// The views as a nerfstudio transforms.json.
+    Nerfstudio,
+}
+
+/// Arguments of `config`.
+#[derive(Debug, Clone, Args)]
+pub struct Configure {
+    /// Configuration to print.
+    #[command(flatten)]
+    pub settings: Settings,
+}
+
+/// Arguments of a service's command.
+#[derive(Debug, Clone, Args)]
+pub struct Service {
+    /// Configuration of a system that does not exist yet; one that runs has its own.
+    #[command(flatten)]
+    pub settings: Settings,
+    /// Name or folder of the system to join; made if there is none of that name. Default: the only one there is.
+    #[arg(long, value_name = "NAME")]
+    pub system: Option<String>,
+    /// Started by a supervisor: stop when it is gone.
+    #[arg(long, hide = true)]
+    pub supervised: bool,
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::CommandFactory as _;
+
+    use super::*;
+
+    #[test]
+    fn every_subcommand_explains_itself_with_an_example() {
+        Cli::command().debug_assert();
+        for command in Cli::command().get_subcommands() {
+            let help = command.get_after_help().map(ToString::to_string).unwrap_or_default();
+            let begin = format!("Example: vantage {}", command.get_name());
+            assert!(help.starts_with(&begin), "{}: {help}", command.get_name());
+            assert!(command.get_about().is_some());
+        }
+    }
+
+    #[test]
+    fn every_started_service_has_a_command_of_its_name() {
+        for service in crate::supervise::plan::START_ORDER {
+            let cli = Cli::try_parse_from(["vantage", service.name(), "--system", "x"]).expect("parses");
+            let Command::Process(process) = cli.command else { panic!("{service} is no process") };
+            assert_eq!(process.service().0, service);
+        }
+    }
+
+    #[test]
+    fn the_examples_parse() {
+        for command in Cli::command().get_subcommands() {
+            let help = command.get_after_help().map(ToString::to_string).unwrap_or_default();
+            let line = help.trim_start_matches("Example: ").split(" > ").next().unwrap_or_default().to_owned();
+            assert!(Cli::try_parse_from(line.split_whitespace()).is_ok(), "{line}");
+        }
+    }
+}

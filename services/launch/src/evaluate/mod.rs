@@ -1,0 +1,157 @@
+//! What a mission is worth: the figures of `report/metrics.json`, from the mission folder and the ground truth.
+//!
+//! [`metrics`] are the keys, [`flight`] is what the supervisor saw, [`journal`] what the planner wrote down, [`truth`] the
+//! world that was flown in, [`views`] the held-out views, [`pictures`] the renders for people.
+
+pub mod flight;
+pub mod journal;
+pub mod metrics;
+pub mod pictures;
+pub mod truth;
+pub mod views;
+
+use std::path::Path;
+
+use anyhow::Context as _;
+use shared_types::config::{Config, Layer, load};
+use shared_types::folder::{FolderError, MissionFolder, write_atomic};
+use shared_types::frames::Pose;
+use splatting::Gaussians;
+
+use crate::cli::Evaluate;
+use crate::exit::{Exit, Refusal};
+use crate::supervise::track;
+use crate::{print, summary};
+pub use metrics::Metrics;
+use truth::Truth;
+
+/// What is measured, and how finely.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Effort {
+    /// Held-out views, both radii together.
+    pub views: usize,
+    /// Width of the held-out views, pixels.
+    pub width: u32,
+    /// Height of the held-out views, pixels.
+    pub height: u32,
+}
+
+impl Effort {
+    /// The effort of a configuration: its number of views, at the size that the model was trained at.
+    #[must_use]
+    pub fn of(config: &Config) -> Self {
+        Self { views: config.launch.evaluate_views as usize, width: config.model.width, height: config.model.height }
+    }
+}
+
+/// `vantage evaluate`.
+///
+/// # Errors
+/// When the folder holds no mission or no model, or the object of the mission cannot be read.
+pub fn run(arguments: &Evaluate) -> anyhow::Result<Exit> {
+    let folder = MissionFolder::open(&arguments.folder)?;
+    let config = load(&[Layer::of_file(&folder.config_path())?])?;
+    let mut effort = Effort::of(&config);
+    if let Some(views) = arguments.views {
+        effort.views = views.clamp(2, 1000) as usize;
+    }
+    if let Some(width) = arguments.width {
+        effort.width = width.clamp(32, 4096);
+        effort.height = (effort.width * config.camera.height_px).div_ceil(config.camera.width_px.max(1)).max(1);
+    }
+    let metrics = measure(&folder, &config, effort, arguments.model.as_deref())?;
+    // Figures of another model are not the mission's.
+    if arguments.model.is_none() {
+        write_metrics(&folder, &metrics)?;
+    }
+    print(&if arguments.json { to_json(&metrics)? } else { summary::table(&metrics, folder.root()) })
+}
+
+/// Measures a mission: everything that its folder and the ground truth tell. Also renders the pictures of the report.
+///
+/// # Errors
+/// When there is no model, or the object of the mission cannot be read.
+pub fn measure(
+    folder: &MissionFolder,
+    config: &Config,
+    effort: Effort,
+    model: Option<&Path>,
+) -> anyhow::Result<Metrics> {
+    let own = folder.model_path().join("model.ply");
+    let gaussians = read_model(model.unwrap_or(&own))?;
+    let mut metrics = Metrics::of_folder(config, &flight::read(folder)?, &journal::read(&folder.journal_path())?);
+    metrics.live.gaussians = Some(gaussians.len());
+    metrics.memory.insert("model_mb".to_owned(), file_mb(&own));
+    let poses = keyframe_poses(folder)?;
+    metrics.mission.keyframes.get_or_insert(poses.len());
+    if !config.link.is_local() {
+        // A real world has no ground truth.
+        return Ok(metrics);
+    }
+    let truth = Truth::build(config)?;
+    let views = views::held_out(&truth, effort)?;
+    let quality = views::appearance(&truth, &gaussians, &views, effort)?;
+    metrics.live.take(&quality);
+    let untrained = folder.model_path().join("init.ply");
+    if model.is_none() && untrained.is_file() {
+        let quality = views::appearance(&truth, &read_model(&untrained)?, &views, effort)?;
+        metrics.live.psnr_init_db = quality.object_db;
+    }
+    if let Some((least_m, collisions)) = truth.clearance(&track::read(&folder.report_path())) {
+        metrics.mission.min_clearance_m = Some(least_m);
+        metrics.mission.collisions = Some(collisions);
+    }
+    metrics.coverage.take(&truth.coverage(&poses));
+    if model.is_none() {
+        pictures::write(folder, &truth, &gaussians)?;
+    }
+    Ok(metrics)
+}
+
+fn file_mb(path: &Path) -> f64 {
+    #[expect(clippy::cast_precision_loss, reason = "file sizes are far below 2^53")]
+    let bytes = std::fs::metadata(path).map_or(0.0, |data| data.len() as f64);
+    (bytes / 1e5).round() / 10.0
+}
+
+/// Measured poses of the keyframes, in the order of their ids.
+fn keyframe_poses(folder: &MissionFolder) -> Result<Vec<Pose>, FolderError> {
+    let mut poses = Vec::new();
+    for id in folder.list_keyframes()? {
+        let frame = folder.read_frame(shared_types::messages::KeyframeReason::Selected, id)?;
+        poses.extend(frame.map(|frame| frame.world_from_camera()));
+    }
+    Ok(poses)
+}
+
+/// Reads a model.
+///
+/// # Errors
+/// Exit 1 when there is none, or it is truncated or no INRIA PLY.
+pub fn read_model(path: &Path) -> anyhow::Result<Gaussians> {
+    let bytes = std::fs::read(path).map_err(|error| {
+        let way_out = "expected the model of a finished mission; `vantage resume` finishes one that was cut off";
+        Refusal::failed(format!("{}: {error}; {way_out}", path.display()))
+    })?;
+    splatting::ply::read(&bytes).map_err(|error| {
+        Refusal::failed(format!("{}: {error}; expected a whole INRIA PLY, such as model/rounds/*.ply", path.display()))
+    })
+}
+
+/// `report/metrics.json` as text.
+///
+/// # Errors
+/// Never in practice: every key is text and every number finite.
+pub fn to_json(metrics: &Metrics) -> anyhow::Result<String> {
+    Ok(serde_json::to_string_pretty(metrics).context("metrics")? + "\n")
+}
+
+/// Writes `report/metrics.json`.
+///
+/// # Errors
+/// When the file cannot be written.
+pub fn write_metrics(folder: &MissionFolder, metrics: &Metrics) -> anyhow::Result<()> {
+    std::fs::create_dir_all(folder.report_path())?;
+    write_atomic(&folder.report_path().join("metrics.json"), to_json(metrics)?.as_bytes())?;
+    Ok(())
+}

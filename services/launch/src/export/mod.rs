@@ -1,0 +1,138 @@
+//! A mission folder for other people's tools: COLMAP, nerfstudio, and the model as PLY.
+//!
+//! `export(&MissionFolder, Format, out: &Path) -> Result<Summary, ExportError>` does it all. `out` is a folder for COLMAP
+//! and nerfstudio, a file for PLY. Every file appears whole; the images are the keyframes' own files, copied.
+
+use std::path::{Path, PathBuf};
+
+use glam::DVec3;
+use shared_types::folder::{FolderError, Keyframe, MissionFolder, write_atomic};
+use shared_types::frames::Intrinsics;
+
+pub mod colmap;
+pub mod nerfstudio;
+
+/// Points taken from the depth of each keyframe, about.
+const POINTS_PER_VIEW: f64 = 2_000.0;
+
+/// What a mission can be exported as.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Format {
+    /// `images/` and `sparse/0/` with cameras, images and points3D, as text and as binary.
+    Colmap,
+    /// `images/`, `depth/`, `points.ply` and `transforms.json`.
+    Nerfstudio,
+    /// The final model, in the layout of the original 3D Gaussian Splatting code.
+    Ply,
+}
+
+/// What was written.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Summary {
+    /// Keyframes exported.
+    pub views: usize,
+    /// Points exported.
+    pub points: usize,
+}
+
+/// Why an export failed.
+#[derive(Debug, thiserror::Error)]
+pub enum ExportError {
+    /// The mission folder could not be read, or the result not be written.
+    #[error(transparent)]
+    Folder(#[from] FolderError),
+    /// A file could not be read.
+    #[error("cannot read {path}: {source}")]
+    Read {
+        /// The file.
+        path: PathBuf,
+        /// The system's reason.
+        source: std::io::Error,
+    },
+    /// There is nothing to export.
+    #[error("{path} does not exist: {way_out}")]
+    Missing {
+        /// What is missing.
+        path: PathBuf,
+        /// What to do.
+        way_out: &'static str,
+    },
+}
+
+/// A coloured point in the world.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Point {
+    /// Position, metres.
+    pub position_m: DVec3,
+    /// sRGB.
+    pub rgb: [u8; 3],
+}
+
+/// Exports a mission.
+///
+/// # Errors
+/// When the mission holds nothing of the kind, a file is damaged, or the result cannot be written.
+pub fn export(folder: &MissionFolder, format: Format, out: &Path) -> Result<Summary, ExportError> {
+    if format == Format::Ply {
+        let path = folder.model_path().join("model.ply");
+        if !path.is_file() {
+            let way_out = "finish the mission first with `vantage resume`";
+            return Err(ExportError::Missing { path, way_out });
+        }
+        write_atomic(out, &read(&path)?)?;
+        return Ok(Summary::default());
+    }
+    let mut views = Vec::new();
+    let mut points = Vec::new();
+    for id in folder.list_keyframes()? {
+        let Some(keyframe) = folder.read_keyframe(id)? else { continue };
+        points.extend(points_of(&keyframe));
+        let source = folder.keyframe_path(id);
+        let name = format!("{id:06}.png");
+        write_atomic(&out.join("images").join(&name), &read(&source.join("rgb.png"))?)?;
+        if format == Format::Nerfstudio {
+            write_atomic(&out.join("depth").join(&name), &read(&source.join("depth.png"))?)?;
+        }
+        views.push(keyframe.frame);
+    }
+    if views.is_empty() {
+        let way_out = "the mission took no keyframes; fly it on with `vantage resume`";
+        return Err(ExportError::Missing { path: folder.keyframes_path(), way_out });
+    }
+    match format {
+        Format::Colmap => colmap::write(out, &views, &points)?,
+        Format::Nerfstudio => nerfstudio::write(out, &views, &points)?,
+        Format::Ply => {}
+    }
+    Ok(Summary { views: views.len(), points: points.len() })
+}
+
+/// Points of a keyframe's depth in the world, on a regular grid of pixels.
+fn points_of(keyframe: &Keyframe) -> Vec<Point> {
+    let (camera, pose) = (keyframe.frame.intrinsics, keyframe.frame.world_from_camera());
+    let pixels = f64::from(camera.width) * f64::from(camera.height);
+    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "at least 1 and at most a side")]
+    let stride = (pixels / POINTS_PER_VIEW).sqrt().ceil().max(1.0) as usize;
+    let mut points = Vec::new();
+    for row in (0..camera.height).step_by(stride) {
+        for column in (0..camera.width).step_by(stride) {
+            let index = (row * camera.width + column) as usize;
+            let units = keyframe.depth_units.get(index).copied().unwrap_or(0);
+            let rgb = keyframe.rgb.get(index * 3..index * 3 + 3).and_then(|rgb| rgb.try_into().ok());
+            if let (1.., Some(rgb)) = (units, rgb) {
+                let depth_m = f64::from(units) * keyframe.frame.depth_unit_m;
+                let position_m =
+                    pose.transform_point(camera.backproject(Intrinsics::pixel_center(column, row), depth_m));
+                points.push(Point { position_m, rgb });
+            }
+        }
+    }
+    points
+}
+
+fn read(path: &Path) -> Result<Vec<u8>, ExportError> {
+    std::fs::read(path).map_err(|source| ExportError::Read { path: path.to_owned(), source })
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,111 @@
+//! The `vantage` command: starts, watches and restarts the services of a mission; offline tools.
+//!
+//! - [`cli`], [`settings`]: arguments, and the configuration they resolve to;
+//! - [`service`]: one process of a mission in the foreground;
+//! - [`fly`], [`supervise`], [`progress`], [`summary`]: a whole mission;
+//! - [`evaluate`], [`export`]: what a mission folder is worth, and how it leaves Vantage;
+//! - [`status`], [`doctor`]: what runs, and whether this machine is fit for it.
+
+#![forbid(unsafe_code)]
+
+pub mod cli;
+pub mod clock;
+pub mod doctor;
+pub mod evaluate;
+pub mod exit;
+pub mod export;
+pub mod fly;
+pub mod instance;
+pub mod machine_check;
+pub mod proc;
+pub mod progress;
+pub mod service;
+pub mod settings;
+pub mod status;
+pub mod summary;
+pub mod supervise;
+
+use std::process::ExitCode;
+
+use clap::Parser as _;
+use clap::error::ErrorKind;
+use tracing_subscriber::filter::LevelFilter;
+
+use cli::{Cli, Command};
+use exit::{Exit, exit_of};
+use shared_types::folder::MissionFolder;
+
+/// The whole command: parses the arguments, does what they say, and tells how it went.
+#[must_use]
+pub fn main() -> ExitCode {
+    let cli = match Cli::try_parse() {
+        Ok(cli) => cli,
+        Err(error) => {
+            let asked_for = matches!(error.kind(), ErrorKind::DisplayHelp | ErrorKind::DisplayVersion);
+            // Nothing can be said about a closed terminal.
+            error.print().ok();
+            return if asked_for { Exit::Ok.into() } else { Exit::Usage.into() };
+        }
+    };
+    let is_service = matches!(cli.command, Command::Process(_));
+    shared_types::logging::init(if is_service { LevelFilter::INFO } else { LevelFilter::WARN });
+    match run(&cli.command) {
+        Ok(exit) => exit.into(),
+        Err(error) => {
+            eprintln!("vantage: {error:#}");
+            exit_of(&error).into()
+        }
+    }
+}
+
+fn run(command: &Command) -> anyhow::Result<Exit> {
+    match command {
+        Command::Process(process) => {
+            let (name, arguments) = process.service();
+            service::run(name, arguments).map(|()| Exit::Ok)
+        }
+        Command::Fly(arguments) => fly::fly(arguments),
+        Command::Resume(arguments) => fly::resume(arguments),
+        Command::Status(arguments) => status::run(arguments),
+        Command::Doctor(arguments) => doctor::run(arguments),
+        Command::Evaluate(arguments) => evaluate::run(arguments),
+        Command::Export(arguments) => export_mission(arguments),
+        Command::Config(arguments) => {
+            print(&shared_types::config::commented(&settings::resolve(&arguments.settings)?)?)
+        }
+    }
+}
+
+fn export_mission(arguments: &cli::Export) -> anyhow::Result<Exit> {
+    let folder = MissionFolder::open(&arguments.folder)?;
+    let (format, name) = match arguments.format {
+        cli::Format::Ply => (export::Format::Ply, "model.ply"),
+        cli::Format::Colmap => (export::Format::Colmap, "colmap"),
+        cli::Format::Nerfstudio => (export::Format::Nerfstudio, "nerfstudio"),
+    };
+    let out = arguments.output.clone().unwrap_or_else(|| folder.root().join("export").join(name));
+    if let Some(parent) = out.parent() {
+        std::fs::create_dir_all(parent)?;
+    }
+    if format == export::Format::Ply {
+        // A damaged model is refused here and not in the reader's tool.
+        evaluate::read_model(&folder.model_path().join("model.ply"))?;
+    }
+    let summary = export::export(&folder, format, &out).map_err(|error| match error {
+        export::ExportError::Folder(error) => error.into(),
+        other => exit::Refusal::failed(other.to_string()),
+    })?;
+    match summary.views {
+        0 => print(&format!("{}\n", out.display())),
+        views => print(&format!("{}: {views} views, {} points\n", out.display(), summary.points)),
+    }
+}
+
+/// Writes to standard output; a reader that has seen enough (`| head`) is no error.
+pub(crate) fn print(text: &str) -> anyhow::Result<Exit> {
+    use std::io::Write as _;
+    match std::io::stdout().write_all(text.as_bytes()) {
+        Err(error) if error.kind() != std::io::ErrorKind::BrokenPipe => Err(error.into()),
+        _ => Ok(Exit::Ok),
+    }
+}

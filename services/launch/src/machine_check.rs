@@ -1,0 +1,116 @@
+//! What a mission needs of this machine before it may take off: shared memory and disk space.
+
+use std::path::Path;
+
+use rustix::fs::statvfs;
+use shared_types::bus::Limits;
+use shared_types::config::Config;
+use shared_types::system::SHARED_MEMORY_DIR;
+
+use crate::exit::Refusal;
+
+/// Bytes of one Gaussian on the snapshot channel.
+const GAUSSIAN_BYTES: u64 = size_of::<shared_types::messages::GaussianRow>() as u64;
+
+/// Shared memory that a mission reserves, bytes: chunks of the large channels (the channel table's numbers) and 16 MiB for
+/// all others.
+#[must_use]
+pub fn shared_memory_need_bytes(config: &Config) -> u64 {
+    use shared_types::channel::{Channel, DepthChannel, FrameChannel, KeyframeChannel, RenderReplies, SnapshotChannel};
+    let limits = Limits::of(config);
+    let chunks = |chunks: Option<usize>| chunks.unwrap_or(1) as u64;
+    let images = chunks(FrameChannel::SETTINGS.chunks)
+        + chunks(KeyframeChannel::SETTINGS.chunks)
+        + chunks(RenderReplies::SETTINGS.chunks);
+    images * limits.image_bytes as u64
+        + chunks(DepthChannel::SETTINGS.chunks) * limits.small_depth_bytes as u64
+        + chunks(SnapshotChannel::SETTINGS.chunks) * limits.gaussians as u64 * GAUSSIAN_BYTES
+        + (16 << 20)
+}
+
+/// Disk space that a mission may take, bytes: keyframes as PNG, three checkpoints with the optimiser's moments, models.
+#[must_use]
+pub fn disk_need_bytes(config: &Config) -> u64 {
+    let pixels = u64::from(config.camera.width_px) * u64::from(config.camera.height_px);
+    let views = u64::from(config.planner.keyframes) + 2;
+    views * pixels * 4 + Limits::of(config).gaussians as u64 * GAUSSIAN_BYTES * 3 / 2 + (4 << 20)
+}
+
+/// Size and free space of the file system that holds a path, bytes.
+///
+/// # Errors
+/// When there is no such path.
+pub fn space_bytes(path: &Path) -> std::io::Result<(u64, u64)> {
+    let status = statvfs(path)?;
+    Ok((status.f_blocks * status.f_frsize, status.f_bavail * status.f_frsize))
+}
+
+fn mib(bytes: u64) -> u64 {
+    bytes.div_ceil(1 << 20)
+}
+
+/// Refuses a machine without enough shared memory.
+///
+/// # Errors
+/// Exit 69, with what is missing and the way out.
+pub fn check_shared_memory(config: &Config) -> anyhow::Result<()> {
+    let need = shared_memory_need_bytes(config);
+    match space_bytes(Path::new(SHARED_MEMORY_DIR)) {
+        Err(error) => Err(Refusal::missing(format!(
+            "{SHARED_MEMORY_DIR}: {error}; expected a tmpfs with {} MiB free: mount one (`mount -t tmpfs tmpfs {SHARED_MEMORY_DIR}`)",
+            mib(need)
+        ))),
+        Ok((_, free)) if free < need => Err(Refusal::missing(format!(
+            "{SHARED_MEMORY_DIR}: {} MiB free, expected at least {} MiB; enlarge it (`mount -o remount,size=1G {SHARED_MEMORY_DIR}`, \
+             docker `--shm-size 1g`), remove leftovers (`vantage doctor --clean`) or lower model.max_gaussians ({})",
+            mib(free),
+            mib(need),
+            config.model.max_gaussians
+        ))),
+        Ok(_) => Ok(()),
+    }
+}
+
+/// Refuses a disk that cannot hold the mission.
+///
+/// # Errors
+/// Exit 69, with what is missing and the way out.
+pub fn check_disk(folder: &Path, config: &Config) -> anyhow::Result<()> {
+    let need = disk_need_bytes(config);
+    let (_, free) = space_bytes(folder)?;
+    if free >= need {
+        return Ok(());
+    }
+    Err(Refusal::missing(format!(
+        "{}: {} MiB free, expected at least {} MiB for {} keyframes and the model; free disk space, or choose another folder with --output",
+        folder.display(),
+        mib(free),
+        mib(need),
+        config.planner.keyframes
+    )))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_need_grows_with_the_model_and_the_image() {
+        let small = shared_types::config::preset("tiny").expect("preset");
+        let large = Config::default();
+        assert!(shared_memory_need_bytes(&small) < shared_memory_need_bytes(&large) / 2);
+        assert!(disk_need_bytes(&small) < disk_need_bytes(&large) / 2);
+    }
+
+    #[test]
+    fn a_machine_that_is_too_small_is_told_the_way_out() {
+        let mut config = Config::default();
+        config.model.max_gaussians = 4_000_000_000;
+        let message = check_shared_memory(&config).expect_err("too small").to_string();
+        assert!(message.contains("/dev/shm") && message.contains("model.max_gaussians"), "{message}");
+        config.camera.width_px = 1_000_000;
+        config.camera.height_px = 1_000_000;
+        let message = check_disk(Path::new("/tmp"), &config).expect_err("too small").to_string();
+        assert!(message.contains("--output"), "{message}");
+    }
+}

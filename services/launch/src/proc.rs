@@ -1,0 +1,91 @@
+//! What `/proc` says of a process: state, memory, start.
+
+use std::fs;
+
+/// Proportional set size of a process, bytes: private memory plus its share of what it shares. `None` when the process is
+/// gone or may not be looked at.
+#[must_use]
+pub fn pss_bytes(pid: u32) -> Option<u64> {
+    pss_of(&fs::read_to_string(format!("/proc/{pid}/smaps_rollup")).ok()?)
+}
+
+fn pss_of(rollup: &str) -> Option<u64> {
+    let line = rollup.lines().find_map(|line| line.strip_prefix("Pss:"))?;
+    Some(line.split_whitespace().next()?.parse::<u64>().ok()? * 1024)
+}
+
+/// Whether a process runs (a zombie does not).
+#[must_use]
+pub fn is_alive(pid: u32) -> bool {
+    fs::read_to_string(format!("/proc/{pid}/stat"))
+        .ok()
+        .and_then(|stat| state_of(&stat))
+        .is_some_and(|state| state != 'Z')
+}
+
+/// State letter of a stat line; the process's name in it may hold anything, so the last ')' counts.
+fn state_of(stat: &str) -> Option<char> {
+    stat.rsplit_once(") ")?.1.chars().next()
+}
+
+/// Seconds since a process started; `None` when it is gone.
+#[must_use]
+pub fn age_s(pid: u32) -> Option<f64> {
+    let stat = fs::read_to_string(format!("/proc/{pid}/stat")).ok()?;
+    let uptime: f64 = fs::read_to_string("/proc/uptime").ok()?.split_whitespace().next()?.parse().ok()?;
+    let ticks = start_ticks_of(&stat)?;
+    let per_second = rustix::param::clock_ticks_per_second();
+    #[expect(clippy::cast_precision_loss, reason = "clock ticks since boot are far below 2^53")]
+    let started_s = ticks as f64 / per_second as f64;
+    Some((uptime - started_s).max(0.0))
+}
+
+/// Field 22 of a stat line: the start, clock ticks after boot.
+fn start_ticks_of(stat: &str) -> Option<u64> {
+    // What follows the name begins with field 3.
+    stat.rsplit_once(") ")?.1.split_whitespace().nth(22 - 3)?.parse().ok()
+}
+
+/// The nice value of a process; `None` when it is gone.
+#[must_use]
+pub fn nice(pid: u32) -> Option<i32> {
+    let stat = fs::read_to_string(format!("/proc/{pid}/stat")).ok()?;
+    stat.rsplit_once(") ")?.1.split_whitespace().nth(19 - 3)?.parse().ok()
+}
+
+/// Whether any process's arguments name a path: how a service tells which system it belongs to.
+#[must_use]
+pub fn any_command_line_names(path: &std::path::Path) -> bool {
+    let wanted = path.as_os_str().as_encoded_bytes();
+    let processes = fs::read_dir("/proc").into_iter().flatten().flatten();
+    processes
+        .filter(|entry| entry.file_name().to_string_lossy().bytes().all(|b| b.is_ascii_digit()))
+        .filter_map(|entry| fs::read(entry.path().join("cmdline")).ok())
+        .any(|line| line.split(|byte| *byte == 0).any(|argument| argument == wanted))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_stat_line_is_read_past_a_name_with_brackets() {
+        let stat = "77 (a ) b) S 1 77 77 0 -1 4194560 100 0 0 0 5 3 0 0 20 7 4 0 123456 1000 200";
+        assert_eq!((state_of(stat), start_ticks_of(stat)), (Some('S'), Some(123_456)));
+    }
+
+    #[test]
+    fn this_process_is_alive_has_memory_and_a_start() {
+        let pid = std::process::id();
+        assert!(is_alive(pid));
+        assert!(pss_bytes(pid).is_some_and(|bytes| bytes > 100_000));
+        assert!(age_s(pid).is_some_and(|age| age < 3600.0));
+        assert!(nice(pid).is_some());
+        assert_eq!(pss_of("00400000-7ffd rollup\nRss:  900 kB\nPss:  123 kB\n"), Some(123 * 1024));
+    }
+
+    #[test]
+    fn a_process_that_never_was_is_not_alive() {
+        assert!(!is_alive(u32::MAX) && age_s(u32::MAX).is_none() && pss_bytes(u32::MAX).is_none());
+    }
+}

@@ -1,0 +1,256 @@
+//! `vantage status`: what runs, since when, memory, and how old the last messages are.
+
+use std::fmt::Write as _;
+use std::time::{Duration, Instant};
+
+use serde::Serialize;
+use shared_types::ServiceName;
+use shared_types::bus::{Bus, Limits};
+use shared_types::channel::{HealthChannel, HealthLastChannel, MissionStateChannel};
+use shared_types::config::{Layer, load};
+use shared_types::messages::{Health, MissionState, ServiceState};
+use shared_types::payload::unpack_text;
+use shared_types::system::System;
+
+use crate::cli::Status;
+use crate::clock::monotonic_ns;
+use crate::exit::Exit;
+use crate::progress::Report;
+use crate::{print, proc};
+
+/// Services send health once a second; a little more than that is listened for.
+const LISTEN: Duration = Duration::from_millis(1_300);
+
+/// What is known of a service.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct ServiceRow {
+    /// Name.
+    pub service: String,
+    /// Process id.
+    pub pid: u32,
+    /// Whether the process runs.
+    pub alive: bool,
+    /// What it says it is doing.
+    pub state: String,
+    /// Seconds since its start.
+    pub age_s: Option<f64>,
+    /// Wall time since health was heard from it, seconds; absent when nothing came while listening.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub heard_s: Option<f64>,
+    /// nice value.
+    pub nice: Option<i32>,
+    /// Proportional memory, megabytes.
+    pub pss_mb: Option<f64>,
+    /// 99th percentile of a turn, milliseconds.
+    pub turn_p99_ms: f64,
+    /// Messages received, sent and lost.
+    pub messages: [u64; 3],
+    /// What went wrong last.
+    pub last_error: String,
+}
+
+/// What is known of a system.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct SystemReport {
+    /// Name.
+    pub system: String,
+    /// Folder.
+    pub folder: String,
+    /// Supervisor's process id; 0: none.
+    pub supervisor_pid: u32,
+    /// Whether the supervisor runs.
+    pub supervised: bool,
+    /// What the mission says.
+    pub mission: Option<String>,
+    /// Services.
+    pub services: Vec<ServiceRow>,
+}
+
+/// `vantage status`.
+///
+/// # Errors
+/// When there is no such system, or its bus cannot be joined.
+pub fn run(arguments: &Status) -> anyhow::Result<Exit> {
+    let base = System::base_dir();
+    let systems = match arguments.system.as_deref() {
+        Some(name) => vec![System::find(&base, Some(name))?],
+        None => System::list(&base),
+    };
+    let mut reports = Vec::new();
+    for system in &systems {
+        reports.push(look_at(system)?);
+    }
+    let text = if arguments.json {
+        serde_json::to_string_pretty(&reports)? + "\n"
+    } else if reports.is_empty() {
+        format!("nothing runs: no system in {}\n", base.display())
+    } else {
+        reports.iter().map(describe).collect()
+    };
+    print(&text)
+}
+
+fn look_at(system: &System) -> anyhow::Result<SystemReport> {
+    let supervised = system.supervisor_pid != 0 && proc::is_alive(system.supervisor_pid);
+    let mut report = SystemReport {
+        system: system.name.clone(),
+        folder: system.runtime_dir.display().to_string(),
+        supervisor_pid: system.supervisor_pid,
+        supervised,
+        mission: None,
+        services: Vec::new(),
+    };
+    let Ok(layer) = Layer::of_file(&system.config_path()) else { return Ok(report) };
+    let config = load(&[layer])?;
+    let bus = Bus::open(system, Limits::of(&config), ServiceName::Command, monotonic_ns(), false)?;
+    let mut last = bus.subscriber::<HealthLastChannel>()?;
+    let mut fresh = bus.subscriber::<HealthChannel>()?;
+    let mut missions = bus.subscriber::<MissionStateChannel>()?;
+    let mut known: Vec<(Health, Option<Instant>)> = Vec::new();
+    let mut mission: Option<(u64, MissionState)> = None;
+    let began = Instant::now();
+    while began.elapsed() < LISTEN {
+        if let Some(message) = last.latest(0)? {
+            for health in message.items() {
+                note(&mut known, health, None);
+            }
+        }
+        while let Some(message) = fresh.receive(0)? {
+            note(&mut known, message.header(), Some(Instant::now()));
+        }
+        if let Some(message) = missions.latest(0)? {
+            mission = Some((message.stamp_ns(), *message.header()));
+        }
+        std::thread::sleep(Duration::from_millis(20));
+    }
+    known.sort_by_key(|(health, _)| health.service);
+    report.services = known.iter().filter_map(|(health, heard)| row(health, *heard)).collect();
+    report.mission = mission.and_then(|(stamp_ns, state)| {
+        let line = Report::of(&state, stamp_ns)?.line();
+        Some(format!("{} {} in {}", unpack_text(&state.mission_id), line.trim_start(), unpack_text(&state.folder)))
+    });
+    Ok(report)
+}
+
+/// Keeps the newest life of each service.
+fn note(known: &mut Vec<(Health, Option<Instant>)>, health: &Health, heard: Option<Instant>) {
+    match known.iter_mut().find(|(other, _)| other.service == health.service) {
+        Some((other, when)) if health.incarnation >= other.incarnation => {
+            *other = *health;
+            *when = heard.or(*when);
+        }
+        Some(_) => {}
+        None => known.push((*health, heard)),
+    }
+}
+
+fn row(health: &Health, heard: Option<Instant>) -> Option<ServiceRow> {
+    let service = ServiceName::from_code(health.service)?;
+    if health.pid == 0 {
+        return None;
+    }
+    #[expect(clippy::cast_precision_loss, reason = "figures for people")]
+    let (pss_mb, turn_p99_ms) =
+        (proc::pss_bytes(health.pid).map(|bytes| bytes as f64 / 1e6), health.turn_p99_ns as f64 / 1e6);
+    Some(ServiceRow {
+        service: service.to_string(),
+        pid: health.pid,
+        alive: proc::is_alive(health.pid),
+        state: ServiceState::from_code(health.state).map_or_else(|| "unknown".to_owned(), |state| state.to_string()),
+        age_s: proc::age_s(health.pid),
+        heard_s: heard.map(|when| when.elapsed().as_secs_f64()),
+        nice: proc::nice(health.pid),
+        pss_mb,
+        turn_p99_ms,
+        messages: [health.received, health.sent, health.dropped],
+        last_error: unpack_text(&health.last_error),
+    })
+}
+
+fn describe(report: &SystemReport) -> String {
+    let mut text = format!("system {} in {}", report.system, report.folder);
+    match (report.supervisor_pid, report.supervised) {
+        (0, _) => text.push_str(", no supervisor\n"),
+        (pid, true) => writeln!(text, ", supervisor {pid}").unwrap_or(()),
+        (pid, false) => {
+            writeln!(text, ", supervisor {pid} is gone: `vantage doctor --clean` removes what is left").unwrap_or(())
+        }
+    }
+    if let Some(mission) = &report.mission {
+        writeln!(text, "mission {mission}").ok();
+    }
+    if report.services.is_empty() {
+        text.push_str("no service was heard\n");
+        return text;
+    }
+    let header = format!(
+        "{:<10} {:>7} {:<9} {:>8} {:>7} {:>4} {:>8} {:>9} {:>9} {:>9} {:>7}",
+        "service", "pid", "state", "age", "heard", "nice", "memory", "turn p99", "received", "sent", "lost"
+    );
+    writeln!(text, "{header}").ok();
+    for row in &report.services {
+        let or_dash = |value: Option<String>| value.unwrap_or_else(|| "-".to_owned());
+        let [received, sent, lost] = row.messages;
+        writeln!(
+            text,
+            "{:<10} {:>7} {:<9} {:>8} {:>7} {:>4} {:>8} {:>9} {received:>9} {sent:>9} {lost:>7}  {}",
+            row.service,
+            row.pid,
+            if row.alive { row.state.as_str() } else { "gone" },
+            or_dash(row.age_s.map(|age| format!("{age:.0} s"))),
+            or_dash(row.heard_s.map(|age| format!("{age:.1} s"))),
+            or_dash(row.nice.map(|nice| nice.to_string())),
+            or_dash(row.pss_mb.map(|mb| format!("{mb:.1} MB"))),
+            format!("{:.2} ms", row.turn_p99_ms),
+            row.last_error
+        )
+        .ok();
+    }
+    text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn health(service: ServiceName, incarnation: u64) -> Health {
+        Health {
+            service: service.code(),
+            incarnation,
+            pid: std::process::id(),
+            state: ServiceState::Running.code(),
+            ..Health::default()
+        }
+    }
+
+    #[test]
+    fn the_newest_life_of_each_service_counts() {
+        let mut known = Vec::new();
+        note(&mut known, &health(ServiceName::Camera, 5), None);
+        note(&mut known, &health(ServiceName::Camera, 9), Some(Instant::now()));
+        note(&mut known, &health(ServiceName::Camera, 7), None);
+        note(&mut known, &health(ServiceName::World, 1), None);
+        assert_eq!(known.len(), 2);
+        assert_eq!(known[0].0.incarnation, 9);
+        assert!(known[0].1.is_some());
+    }
+
+    #[test]
+    fn a_row_tells_of_the_living_process_and_of_the_dead() {
+        let row_here = row(&health(ServiceName::Camera, 1), Some(Instant::now())).expect("row");
+        assert!(row_here.alive && row_here.pss_mb.is_some_and(|mb| mb > 0.1));
+        let dead = Health { pid: u32::MAX, ..health(ServiceName::World, 1) };
+        let row_dead = row(&dead, None).expect("row");
+        assert!(!row_dead.alive && row_dead.pss_mb.is_none());
+        let report = SystemReport {
+            system: "s".into(),
+            folder: "/f".into(),
+            supervisor_pid: 7,
+            supervised: false,
+            mission: None,
+            services: vec![row_here, row_dead],
+        };
+        let text = describe(&report);
+        assert!(text.contains("world") && text.contains("gone") && text.contains("--clean"), "{text}");
+    }
+}

@@ -1,0 +1,375 @@
+//! The supervisor's decisions: a pure state machine. Events and wall time in, actions out.
+//!
+//! Phases: *Starting* (keeper first, then the rest) -> *Flying* (the dead are started again with a back-off) ->
+//! *Returning* (the first Ctrl-C, or a service that cannot be kept alive: the mission is told to return, land and save)
+//! -> *Stopping* (group by group) -> *Over*. A second Ctrl-C goes to *Stopping* at once.
+
+use std::collections::BTreeMap;
+
+use shared_types::ServiceName;
+
+use super::plan::{START_ORDER, STOP_GROUPS};
+
+/// Limits of the supervisor; times in milliseconds of wall time.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Policy {
+    /// Wait before the first restart; doubles with each further death.
+    pub restart_delay_ms: u64,
+    /// Longest wait before a restart.
+    pub restart_delay_max_ms: u64,
+    /// Deaths within the window that are still mended.
+    pub crash_limit: usize,
+    /// The window.
+    pub crash_window_ms: u64,
+    /// Time to stop in order before SIGKILL.
+    pub stop_timeout_ms: u64,
+    /// Time to return, land and save.
+    pub landing_timeout_ms: u64,
+    /// Time that the keeper gets before the others are started without a word from it.
+    pub keeper_timeout_ms: u64,
+}
+
+/// What happened.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Event {
+    /// Begin.
+    Begin,
+    /// Time passes.
+    Tick,
+    /// The service's health was heard.
+    Heard(ServiceName),
+    /// The process ended.
+    Exited {
+        /// Which one.
+        service: ServiceName,
+        /// Exit code; `None` for a signal.
+        code: Option<i32>,
+    },
+    /// Ctrl-C, or SIGTERM.
+    Interrupt,
+    /// The planner's phase is `Done` (true) or `Failed` (false).
+    MissionOver {
+        /// Whether there is a usable model.
+        usable: bool,
+    },
+    /// The motors are off.
+    Disarmed,
+}
+
+/// What to do.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Action {
+    /// Start the process.
+    Start(ServiceName),
+    /// Ask the process to stop in order (SIGTERM).
+    Ask(ServiceName),
+    /// Kill the process.
+    Kill(ServiceName),
+    /// Tell the planner to return, land and save.
+    CommandStop,
+    /// Tell the vehicle to hold where it is.
+    VehicleHold,
+    /// Tell the user.
+    Say(String),
+    /// All processes are gone.
+    Finish(Outcome),
+}
+
+/// How the run ended.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Outcome {
+    /// The mission landed with a usable model.
+    Done,
+    /// The mission is over without one.
+    Failed,
+    /// The user asked twice to stop: the vehicle was left holding.
+    Aborted,
+    /// A service could not be kept alive or never started.
+    Broken {
+        /// Which one.
+        service: ServiceName,
+        /// Its last exit code; `None` for a signal.
+        code: Option<i32>,
+        /// Whether it ever worked in this run.
+        worked: bool,
+    },
+    /// The vehicle did not land in time after the user asked for it.
+    NotLanded,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Member {
+    NotStarted,
+    Running,
+    Waiting { until_ms: u64 },
+    Gone,
+}
+
+#[derive(Debug, Clone, PartialEq, Eq)]
+enum Phase {
+    Starting { since_ms: u64 },
+    Flying,
+    Returning { since_ms: u64 },
+    Stopping { group: usize, since_ms: u64, killed: bool },
+    Over,
+}
+
+#[derive(Debug, Clone)]
+struct Record {
+    member: Member,
+    deaths_ms: Vec<u64>,
+    restarts: u32,
+    heard: bool,
+}
+
+/// The state machine.
+#[derive(Debug, Clone)]
+pub struct Supervisor {
+    policy: Policy,
+    phase: Phase,
+    outcome: Option<Outcome>,
+    members: BTreeMap<ServiceName, Record>,
+    services: Vec<ServiceName>,
+}
+
+impl Supervisor {
+    /// A supervisor of these services; they are started in the order of [`START_ORDER`].
+    #[must_use]
+    pub fn new(policy: Policy, services: &[ServiceName]) -> Self {
+        let services: Vec<ServiceName> = START_ORDER.into_iter().filter(|service| services.contains(service)).collect();
+        let record = Record { member: Member::NotStarted, deaths_ms: Vec::new(), restarts: 0, heard: false };
+        let members = services.iter().map(|service| (*service, record.clone())).collect();
+        Self { policy, phase: Phase::Starting { since_ms: 0 }, outcome: None, members, services }
+    }
+
+    /// How often each service was started again; services that never were are left out.
+    #[must_use]
+    pub fn restarts(&self) -> BTreeMap<ServiceName, u32> {
+        self.members.iter().filter(|(_, r)| r.restarts > 0).map(|(service, r)| (*service, r.restarts)).collect()
+    }
+
+    /// Whether the run is being ended.
+    #[must_use]
+    pub fn is_ending(&self) -> bool {
+        !matches!(self.phase, Phase::Starting { .. } | Phase::Flying)
+    }
+
+    /// One event at a time of the wall's monotonic clock, milliseconds.
+    pub fn step(&mut self, now_ms: u64, event: &Event) -> Vec<Action> {
+        let mut actions = Vec::new();
+        match event {
+            Event::Begin => self.begin(now_ms, &mut actions),
+            Event::Tick => {}
+            Event::Heard(service) => self.heard(*service, &mut actions),
+            Event::Exited { service, code } => self.exited(now_ms, *service, *code, &mut actions),
+            Event::Interrupt => self.interrupt(now_ms, &mut actions),
+            Event::MissionOver { usable } => {
+                if matches!(self.phase, Phase::Starting { .. } | Phase::Flying | Phase::Returning { .. }) {
+                    self.outcome.get_or_insert(if *usable { Outcome::Done } else { Outcome::Failed });
+                    self.stop_group(now_ms, 0, false, &mut actions);
+                }
+            }
+            Event::Disarmed => {
+                // Without a planner nobody reports the mission's end: the vehicle on the ground is the end.
+                let planner_gone = self.member(ServiceName::Planner).is_none_or(|member| member == Member::Gone);
+                if matches!(self.phase, Phase::Returning { .. }) && planner_gone {
+                    self.stop_group(now_ms, 0, false, &mut actions);
+                }
+            }
+        }
+        self.time_passes(now_ms, &mut actions);
+        actions
+    }
+
+    fn member(&self, service: ServiceName) -> Option<Member> {
+        self.members.get(&service).map(|record| record.member)
+    }
+
+    fn begin(&mut self, now_ms: u64, actions: &mut Vec<Action>) {
+        self.phase = Phase::Starting { since_ms: now_ms };
+        match self.services.first().copied() {
+            Some(first) => self.start(first, actions),
+            None => self.finish(actions),
+        }
+    }
+
+    fn start(&mut self, service: ServiceName, actions: &mut Vec<Action>) {
+        if let Some(record) = self.members.get_mut(&service) {
+            record.member = Member::Running;
+            actions.push(Action::Start(service));
+        }
+    }
+
+    fn start_the_rest(&mut self, actions: &mut Vec<Action>) {
+        self.phase = Phase::Flying;
+        for service in self.services.clone() {
+            if self.member(service) == Some(Member::NotStarted) {
+                self.start(service, actions);
+            }
+        }
+    }
+
+    fn heard(&mut self, service: ServiceName, actions: &mut Vec<Action>) {
+        if let Some(record) = self.members.get_mut(&service) {
+            record.heard = true;
+        }
+        if matches!(self.phase, Phase::Starting { .. }) && self.services.first() == Some(&service) {
+            self.start_the_rest(actions);
+        }
+    }
+
+    fn exited(&mut self, now_ms: u64, service: ServiceName, code: Option<i32>, actions: &mut Vec<Action>) {
+        let limit = self.policy.crash_limit;
+        let window = self.policy.crash_window_ms;
+        let ending = matches!(self.phase, Phase::Stopping { .. } | Phase::Over);
+        let Some(record) = self.members.get_mut(&service) else { return };
+        if ending {
+            record.member = Member::Gone;
+            return;
+        }
+        record.deaths_ms.retain(|death| death + window > now_ms);
+        record.deaths_ms.push(now_ms);
+        let (deaths, heard) = (record.deaths_ms.len(), record.heard);
+        // Bad configuration or something missing: the same start would fail the same way.
+        let refuses = !heard && matches!(code, Some(64 | 69));
+        // The simulator is the vehicle itself: a new one would stand on the ground at time zero.
+        let vehicle_lost = service == ServiceName::Simulator && heard;
+        if refuses || vehicle_lost {
+            record.member = Member::Gone;
+            self.outcome.get_or_insert(Outcome::Broken { service, code, worked: heard });
+            self.stop_group(now_ms, 0, vehicle_lost, actions);
+        } else if deaths > limit {
+            record.member = Member::Gone;
+            self.outcome.get_or_insert(Outcome::Broken { service, code, worked: heard });
+            actions.push(Action::Say(format!("{service} died {deaths} times in a row: returning and landing")));
+            self.return_home(now_ms, actions);
+        } else {
+            let doublings = u32::try_from(deaths - 1).unwrap_or(u32::MAX).min(20);
+            let delay = (self.policy.restart_delay_ms << doublings).min(self.policy.restart_delay_max_ms);
+            record.member = Member::Waiting { until_ms: now_ms + delay };
+        }
+    }
+
+    fn return_home(&mut self, now_ms: u64, actions: &mut Vec<Action>) {
+        if matches!(self.phase, Phase::Starting { .. } | Phase::Flying) {
+            self.phase = Phase::Returning { since_ms: now_ms };
+            actions.push(Action::CommandStop);
+        }
+    }
+
+    fn interrupt(&mut self, now_ms: u64, actions: &mut Vec<Action>) {
+        match self.phase {
+            Phase::Starting { .. } => {
+                self.outcome.get_or_insert(Outcome::Failed);
+                actions.push(Action::Say("stopping".to_owned()));
+                self.stop_group(now_ms, 0, false, actions);
+            }
+            Phase::Flying => {
+                let advice = "returning, landing and saving; Ctrl-C again holds the vehicle in place and stops at once";
+                actions.push(Action::Say(advice.to_owned()));
+                self.return_home(now_ms, actions);
+            }
+            Phase::Returning { .. } => {
+                self.outcome = Some(Outcome::Aborted);
+                actions.push(Action::Say("holding the vehicle where it is and stopping at once".to_owned()));
+                actions.push(Action::VehicleHold);
+                self.stop_group(now_ms, 0, true, actions);
+            }
+            Phase::Stopping { group, .. } => self.stop_group(now_ms, group, true, actions),
+            Phase::Over => {}
+        }
+    }
+
+    /// Stops the groups from `group` on: asks the first that still has processes (kills all of them where `at_once`).
+    fn stop_group(&mut self, now_ms: u64, group: usize, at_once: bool, actions: &mut Vec<Action>) {
+        let mut group = group;
+        if at_once {
+            for service in self.running(&STOP_GROUPS.concat()) {
+                actions.push(Action::Kill(service));
+            }
+            self.settle_waiting();
+            self.phase = Phase::Stopping { group: STOP_GROUPS.len() - 1, since_ms: now_ms, killed: true };
+            return;
+        }
+        self.settle_waiting();
+        while let Some(services) = STOP_GROUPS.get(group) {
+            let running = self.running(services);
+            if !running.is_empty() {
+                actions.extend(running.into_iter().map(Action::Ask));
+                self.phase = Phase::Stopping { group, since_ms: now_ms, killed: false };
+                return;
+            }
+            group += 1;
+        }
+        self.finish(actions);
+    }
+
+    /// Whoever waits for a restart is not started again.
+    fn settle_waiting(&mut self) {
+        for record in self.members.values_mut() {
+            if record.member != Member::Running {
+                record.member = Member::Gone;
+            }
+        }
+    }
+
+    fn running(&self, services: &[ServiceName]) -> Vec<ServiceName> {
+        services.iter().copied().filter(|service| self.member(*service) == Some(Member::Running)).collect()
+    }
+
+    fn finish(&mut self, actions: &mut Vec<Action>) {
+        self.phase = Phase::Over;
+        actions.push(Action::Finish(self.outcome.clone().unwrap_or(Outcome::Failed)));
+    }
+
+    fn time_passes(&mut self, now_ms: u64, actions: &mut Vec<Action>) {
+        if !matches!(self.phase, Phase::Stopping { .. } | Phase::Over) {
+            for service in self.services.clone() {
+                let Some(record) = self.members.get_mut(&service) else { continue };
+                if matches!(record.member, Member::Waiting { until_ms } if now_ms >= until_ms) {
+                    record.restarts += 1;
+                    self.start(service, actions);
+                }
+            }
+        }
+        match self.phase {
+            Phase::Starting { since_ms } if now_ms >= since_ms + self.policy.keeper_timeout_ms => {
+                self.start_the_rest(actions);
+            }
+            Phase::Returning { since_ms } if now_ms >= since_ms + self.policy.landing_timeout_ms => {
+                self.outcome.get_or_insert(Outcome::NotLanded);
+                actions.push(Action::Say(
+                    "the vehicle has not landed in time: stopping; px4-link brings it home".to_owned(),
+                ));
+                self.stop_group(now_ms, 0, false, actions);
+            }
+            Phase::Stopping { group, since_ms, killed } => {
+                let services: Vec<ServiceName> = match STOP_GROUPS.get(group) {
+                    Some(_) if killed && group + 1 == STOP_GROUPS.len() => STOP_GROUPS.concat(),
+                    Some(services) => services.to_vec(),
+                    None => Vec::new(),
+                };
+                let running = self.running(&services);
+                // With the vehicle in the air, px4-link's stop is a flight home.
+                let patience = if services == [ServiceName::Px4Link] {
+                    self.policy.landing_timeout_ms.max(self.policy.stop_timeout_ms)
+                } else {
+                    self.policy.stop_timeout_ms
+                };
+                if running.is_empty() {
+                    self.stop_group(now_ms, group + 1, false, actions);
+                } else if !killed && now_ms >= since_ms + patience {
+                    for service in running {
+                        actions.push(Action::Say(format!("{service} did not stop in time and is killed")));
+                        actions.push(Action::Kill(service));
+                    }
+                    self.phase = Phase::Stopping { group, since_ms: now_ms, killed: true };
+                }
+            }
+            _ => {}
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests;

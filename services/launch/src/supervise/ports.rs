@@ -1,0 +1,147 @@
+//! All IPC of the supervisor.
+
+use shared_types::ServiceName;
+use shared_types::bus::{Bus, BusError, Client, Limits, Subscriber};
+use shared_types::channel::{
+    ClockChannel, HealthChannel, MissionCommandChannel, MissionStateChannel, TruthChannel, VehicleCommandChannel,
+    VehicleStateChannel,
+};
+use shared_types::config::{ClockMode, Config};
+use shared_types::messages::{
+    ClockTick, CommandRequest, MissionCommand, MissionRequest, MissionState, Truth, VehicleCommand, VehicleState,
+};
+use shared_types::system::System;
+
+use crate::clock::monotonic_ns;
+
+/// What was heard in one turn.
+#[derive(Debug, Default)]
+pub struct Heard {
+    /// Services whose health came.
+    pub services: Vec<ServiceName>,
+    /// States of the mission, oldest first, with their stamps.
+    pub missions: Vec<(u64, MissionState)>,
+    /// The newest state of the vehicle.
+    pub vehicle: Option<VehicleState>,
+    /// Where the simulated vehicle truly is, tick by tick.
+    pub truths: Vec<Truth>,
+}
+
+/// The supervisor's ends of the channels.
+pub struct Ports {
+    bus: Bus,
+    health: Subscriber<HealthChannel>,
+    missions: Subscriber<MissionStateChannel>,
+    vehicles: Subscriber<VehicleStateChannel>,
+    truths: Subscriber<TruthChannel>,
+    clock: Subscriber<ClockChannel>,
+    mission_commands: Client<MissionCommandChannel>,
+    vehicle_commands: Client<VehicleCommandChannel>,
+    tick: Option<ClockTick>,
+    wall_epoch_ns: Option<u64>,
+    next_id: u64,
+}
+
+impl core::fmt::Debug for Ports {
+    fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
+        f.debug_struct("Ports").field("bus", &self.bus).finish_non_exhaustive()
+    }
+}
+
+impl Ports {
+    /// Joins the system.
+    ///
+    /// # Errors
+    /// When shared memory cannot be used.
+    pub fn open(system: &System, config: &Config) -> Result<Self, BusError> {
+        let born_ns = monotonic_ns();
+        let bus = Bus::open(system, Limits::of(config), ServiceName::Launch, born_ns, false)?;
+        Ok(Self {
+            health: bus.subscriber()?,
+            missions: bus.subscriber()?,
+            vehicles: bus.subscriber()?,
+            truths: bus.subscriber()?,
+            clock: bus.subscriber()?,
+            mission_commands: bus.client()?,
+            vehicle_commands: bus.client()?,
+            bus,
+            tick: None,
+            wall_epoch_ns: (config.clock.mode == ClockMode::Wall).then_some(config.mission.epoch_ns),
+            // Unique over restarts of the supervisor: ids count up from its birth.
+            next_id: born_ns,
+        })
+    }
+
+    /// Receives everything that has come.
+    ///
+    /// # Errors
+    /// When a channel is broken.
+    pub fn receive(&mut self) -> Result<Heard, BusError> {
+        if let Some(message) = self.clock.latest(0)? {
+            self.tick = Some(*message.header());
+        }
+        let mut heard = Heard::default();
+        let now_ns = self.now_ns();
+        while let Some(message) = self.health.receive(now_ns)? {
+            heard.services.extend(ServiceName::from_code(message.header().service));
+        }
+        while let Some(message) = self.missions.receive(now_ns)? {
+            heard.missions.push((message.stamp_ns(), *message.header()));
+        }
+        heard.vehicle = self.vehicles.latest(now_ns)?.map(|message| *message.header());
+        while let Some(message) = self.truths.receive(now_ns)? {
+            heard.truths.push(*message.header());
+        }
+        while let Some(reply) = self.mission_commands.receive(now_ns)? {
+            let id = reply.request_id();
+            if reply.header().accepted == 0 {
+                let reason = shared_types::payload::unpack_text(&reply.header().reason);
+                tracing::warn!(%reason, "the planner refuses the command");
+            }
+            drop(reply);
+            self.mission_commands.finish(id);
+        }
+        while let Some(reply) = self.vehicle_commands.receive(now_ns)? {
+            let id = reply.request_id();
+            drop(reply);
+            self.vehicle_commands.finish(id);
+        }
+        self.bus.serve_late_joiners();
+        Ok(heard)
+    }
+
+    /// Mission time, as far as it is known here.
+    #[must_use]
+    pub fn now_ns(&self) -> u64 {
+        match self.wall_epoch_ns {
+            Some(epoch_ns) => monotonic_ns().saturating_add(epoch_ns),
+            None => self.tick.as_ref().map_or(0, |tick| tick.now_ns),
+        }
+    }
+
+    /// How often members were found out of the simulated clock so far; `None` before its first tick.
+    #[must_use]
+    pub fn outs(&self) -> Option<u32> {
+        self.tick.as_ref().map(|tick| tick.outs.iter().sum())
+    }
+
+    /// Tells the planner.
+    ///
+    /// # Errors
+    /// When the request cannot be sent; it is kept and sent again.
+    pub fn command_mission(&mut self, command: MissionCommand) -> Result<(), BusError> {
+        self.next_id += 1;
+        let request = MissionRequest { command: command.code(), reserved: 0 };
+        self.mission_commands.send(self.now_ns(), self.next_id, &request, &[])
+    }
+
+    /// Tells the vehicle.
+    ///
+    /// # Errors
+    /// When the request cannot be sent; it is kept and sent again.
+    pub fn command_vehicle(&mut self, command: VehicleCommand) -> Result<(), BusError> {
+        self.next_id += 1;
+        let request = CommandRequest { command: command.code(), reserved: 0, altitude_m: 0.0 };
+        self.vehicle_commands.send(self.now_ns(), self.next_id, &request, &[])
+    }
+}

@@ -1,0 +1,238 @@
+//! The loop of a supervised run.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+use std::time::{Duration, Instant};
+
+use anyhow::Context as _;
+use shared_types::ServiceName;
+use shared_types::config::{ClockMode, Config};
+use shared_types::messages::{EndReason, MissionCommand, MissionPhase, MissionState, VehicleCommand};
+use shared_types::system::System;
+use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
+use signal_hook::iterator::Signals;
+
+use super::children::{Children, Starter};
+use super::machine::{Action, Event, Outcome, Policy, Supervisor};
+use super::memory::Memory;
+use super::plan::START_ORDER;
+use super::ports::Ports;
+use super::track::Track;
+use crate::proc;
+use crate::progress::{Progress, Report};
+
+const TURN: Duration = Duration::from_millis(20);
+/// Time that the vehicle gets to take the order to hold before everything is killed.
+const HOLD_GRACE: Duration = Duration::from_millis(300);
+
+/// What was seen of a run.
+#[derive(Debug, Clone)]
+pub struct Flight {
+    /// How it ended.
+    pub outcome: Outcome,
+    /// The mission's last state; `None` when it never spoke.
+    pub last: Option<MissionState>,
+    /// Mission time from start to end, seconds; `None` when it never began.
+    pub mission_s: Option<f64>,
+    /// Wall time of the run, seconds.
+    pub wall_s: f64,
+    /// How often services were started again.
+    pub restarts: BTreeMap<ServiceName, u32>,
+    /// Whether the run repeats bit for bit; `None` before the clock began.
+    pub deterministic: Option<bool>,
+    /// Memory in flight.
+    pub memory: Memory,
+    /// For a broken run: what the service said last.
+    pub last_words: Option<String>,
+}
+
+fn policy(config: &Config) -> Policy {
+    let ms = |seconds: f64| shared_types::ns_from_s(seconds) / 1_000_000;
+    Policy {
+        restart_delay_ms: ms(config.launch.restart_delay_s),
+        restart_delay_max_ms: ms(config.launch.restart_delay_max_s),
+        crash_limit: config.launch.crash_limit as usize,
+        crash_window_ms: ms(config.launch.crash_window_s),
+        stop_timeout_ms: ms(config.launch.stop_timeout_s),
+        landing_timeout_ms: ms(config.launch.landing_timeout_s),
+        keeper_timeout_ms: 3_000,
+    }
+}
+
+/// The services of a mission: without a simulated vehicle, neither simulator nor world are started.
+#[must_use]
+pub fn services_of(config: &Config) -> Vec<ServiceName> {
+    let simulated = config.link.is_local();
+    START_ORDER
+        .into_iter()
+        .filter(|service| simulated || !matches!(service, ServiceName::Simulator | ServiceName::World))
+        .collect()
+}
+
+/// Starts the services of a mission and keeps them alive until it is over.
+///
+/// # Errors
+/// When the system cannot be joined or a process cannot be started at all.
+pub fn run(system: &System, config: &Config, starter: Starter, progress: &mut Progress) -> anyhow::Result<Flight> {
+    let mut signals = Signals::new([SIGINT, SIGTERM, SIGHUP]).context("cannot install signal handlers")?;
+    let mut run = Run {
+        supervisor: Supervisor::new(policy(config), &services_of(config)),
+        children: Children::new(starter),
+        ports: Ports::open(system, config)?,
+        progress,
+        began: Instant::now(),
+        memory: Memory::default(),
+        sampled: Instant::now(),
+        last: None,
+        ended_ns: 0,
+        outcome: None,
+        last_words: None,
+        airborne: false,
+        track: Track::default(),
+    };
+    run.event(&Event::Begin);
+    while run.outcome.is_none() {
+        for signal in signals.pending() {
+            tracing::info!(signal, "asked to end");
+            run.event(&Event::Interrupt);
+        }
+        run.turn(config)?;
+        std::thread::sleep(TURN);
+    }
+    if let Err(error) = run.track.append(&Path::new(&config.mission.folder).join("report")) {
+        tracing::warn!(%error, "the track could not be written; clearance will not be measured");
+    }
+    Ok(run.into_flight(config))
+}
+
+struct Run<'a> {
+    supervisor: Supervisor,
+    children: Children,
+    ports: Ports,
+    progress: &'a mut Progress,
+    began: Instant,
+    memory: Memory,
+    sampled: Instant,
+    last: Option<MissionState>,
+    ended_ns: u64,
+    outcome: Option<Outcome>,
+    last_words: Option<String>,
+    airborne: bool,
+    track: Track,
+}
+
+impl Run<'_> {
+    fn turn(&mut self, config: &Config) -> anyhow::Result<()> {
+        let heard = self.ports.receive()?;
+        for service in heard.services {
+            self.event(&Event::Heard(service));
+        }
+        for (stamp_ns, state) in heard.missions {
+            self.mission(stamp_ns, &state);
+        }
+        for truth in &heard.truths {
+            self.track.note(truth);
+        }
+        if let Some(vehicle) = heard.vehicle {
+            if vehicle.armed == 1 {
+                self.airborne = true;
+            } else if core::mem::take(&mut self.airborne) {
+                self.event(&Event::Disarmed);
+            }
+        }
+        for (service, code, how) in self.children.reap() {
+            if !self.supervisor.is_ending() || code != Some(0) {
+                let words = self.children.last_words(service).unwrap_or_default();
+                tracing::info!(%service, %how, %words, "a service ended");
+                if !self.supervisor.is_ending() {
+                    self.progress
+                        .say(&format!("{service} ended ({how}); see {}", self.children.log_path(service).display()));
+                }
+                if !words.is_empty() {
+                    self.last_words = Some(words);
+                }
+            }
+            self.event(&Event::Exited { service, code });
+        }
+        self.event(&Event::Tick);
+        let period = config.launch.memory_period_s;
+        if period > 0.0 && self.sampled.elapsed().as_secs_f64() >= period && !self.supervisor.is_ending() {
+            self.sampled = Instant::now();
+            let sizes: Vec<_> = self
+                .children
+                .pids()
+                .into_iter()
+                .filter_map(|(service, pid)| Some((service, proc::pss_bytes(pid)?)))
+                .collect();
+            self.memory.sample(&sizes);
+        }
+        Ok(())
+    }
+
+    fn mission(&mut self, stamp_ns: u64, state: &MissionState) {
+        self.last = Some(*state);
+        self.ended_ns = stamp_ns.max(self.ended_ns);
+        let Some(report) = Report::of(state, stamp_ns) else { return };
+        self.progress.show(&report);
+        match report.phase {
+            MissionPhase::Done => self.event(&Event::MissionOver { usable: true }),
+            MissionPhase::Failed => self.event(&Event::MissionOver { usable: false }),
+            _ => {}
+        }
+    }
+
+    /// Takes an event to the state machine, and does what it says.
+    fn event(&mut self, event: &Event) {
+        let now_ms = u64::try_from(self.began.elapsed().as_millis()).unwrap_or(u64::MAX);
+        for action in self.supervisor.step(now_ms, event) {
+            match action {
+                Action::Start(service) => {
+                    if let Err(error) = self.children.start(service) {
+                        self.progress.say(&format!("cannot start {service}: {error}"));
+                        self.event(&Event::Exited { service, code: Some(69) });
+                    }
+                }
+                Action::Ask(service) => self.children.ask(service),
+                Action::Kill(service) => self.children.kill(service),
+                Action::CommandStop => warn_if_lost(self.ports.command_mission(MissionCommand::Stop)),
+                Action::VehicleHold => {
+                    warn_if_lost(self.ports.command_vehicle(VehicleCommand::Hold));
+                    std::thread::sleep(HOLD_GRACE);
+                }
+                Action::Say(text) => self.progress.say(&text),
+                Action::Finish(outcome) => self.outcome = Some(outcome),
+            }
+        }
+    }
+
+    fn into_flight(self, config: &Config) -> Flight {
+        let lockstep = config.clock.mode == ClockMode::Lockstep;
+        let restarts = self.supervisor.restarts();
+        let deterministic =
+            if lockstep { self.ports.outs().map(|outs| outs == 0 && restarts.is_empty()) } else { Some(false) };
+        let mission_s =
+            self.last.as_ref().map(|state| shared_types::s_from_ns(self.ended_ns.saturating_sub(state.started_ns)));
+        Flight {
+            outcome: self.outcome.unwrap_or(Outcome::Failed),
+            last: self.last,
+            mission_s,
+            wall_s: self.began.elapsed().as_secs_f64(),
+            restarts,
+            deterministic,
+            memory: self.memory,
+            last_words: self.last_words,
+        }
+    }
+}
+
+fn warn_if_lost(sent: Result<(), shared_types::bus::BusError>) {
+    if let Err(error) = sent {
+        tracing::warn!(%error, "a command could not be sent at once; it is sent again");
+    }
+}
+
+/// The end reason of a state, if it names one.
+#[must_use]
+pub fn end_reason(state: &MissionState) -> Option<EndReason> {
+    EndReason::from_code(state.end_reason).filter(|reason| *reason != EndReason::None)
+}

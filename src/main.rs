@@ -1,0 +1,7 @@
+//! The `vantage` command.
+
+use std::process::ExitCode;
+
+fn main() -> ExitCode {
+    launch::main()
+}

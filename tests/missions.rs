@@ -1,0 +1,87 @@
+//! Whole missions of the preset `tiny`, with real processes.
+
+#![allow(clippy::expect_used, clippy::panic, clippy::unwrap_used, reason = "a test or bench fails by panicking")]
+
+mod common;
+
+use std::collections::BTreeSet;
+use std::fs;
+
+use common::{Flight, journal, keyframes, metrics};
+
+#[test]
+fn a_mission_lands_with_a_model_and_a_complete_folder_and_leaves_nothing_behind() {
+    let folder = tempfile::tempdir().expect("folder");
+    let folder = folder.path().join("mission");
+    let flight = Flight::start(&folder, &["--preset", "tiny", "--seed", "3", "--system", "whole"]);
+    flight.finish_well();
+
+    let base = shared_types::system::System::base_dir();
+    assert!(!base.join("whole").exists(), "the system's folder is gone");
+    assert_eq!(keyframes(&folder), (0..6).collect::<Vec<u64>>());
+    assert!(folder.join("mission.toml").is_file());
+    let gaussians = splatting::ply::read(&fs::read(folder.join("model/model.ply")).expect("model.ply")).expect("a PLY");
+    assert!(gaussians.len() > 500, "{} Gaussians", gaussians.len());
+
+    let metrics = metrics(&folder);
+    assert_eq!(metrics["mission"]["end_reason"], "complete");
+    assert_eq!(metrics["mission"]["keyframes"], 6);
+    assert_eq!(metrics["mission"]["deterministic"], true);
+    assert_eq!(metrics["mission"]["collisions"], 0);
+    let number = |a: &str, b: &str| metrics[a][b].as_f64().unwrap_or_else(|| panic!("{a}.{b} in {metrics:#}"));
+    assert!(number("live", "psnr_object_db") > number("live", "psnr_null_db") + 1.0, "{metrics:#}");
+    assert!(number("mission", "min_clearance_m") > 0.3, "{metrics:#}");
+    assert!(number("coverage", "cov1_feasible") > 0.5, "{metrics:#}");
+    for name in ["north", "east", "south", "west"] {
+        assert!(folder.join(format!("report/{name}.png")).is_file(), "report/{name}.png");
+    }
+}
+
+#[test]
+fn the_same_seed_flies_the_same_mission_bit_for_bit() {
+    let folder = tempfile::tempdir().expect("folder");
+    // One after the other, so that the second finds another load on the machine than the first beside other tests.
+    let runs: Vec<_> = ["a", "b"]
+        .iter()
+        .map(|name| {
+            let folder = folder.path().join(name);
+            Flight::start(&folder, &["--preset", "tiny", "--seed", "11"]).finish_well();
+            folder
+        })
+        .collect();
+    for file in ["journal.jsonl", "model/model.ply"] {
+        let [a, b] = [0, 1].map(|run: usize| fs::read(runs[run].join(file)).expect(file));
+        let differs = a.iter().zip(&b).position(|(x, y)| x != y);
+        assert!(a == b, "{file} differs from byte {differs:?} on ({} and {} bytes)", a.len(), b.len());
+    }
+}
+
+#[test]
+fn two_missions_fly_side_by_side() {
+    let folder = tempfile::tempdir().expect("folder");
+    let flights: Vec<_> = ["one", "two"]
+        .iter()
+        .map(|name| Flight::start(&folder.path().join(name), &["--preset", "tiny", "--seed", "5"]))
+        .collect();
+    for flight in flights {
+        let folder = flight.folder.clone();
+        flight.finish_well();
+        assert_eq!(keyframes(&folder).len(), 6);
+    }
+}
+
+#[test]
+fn every_decision_is_in_the_journal_once_and_in_order() {
+    let folder = tempfile::tempdir().expect("folder");
+    let folder = folder.path().join("mission");
+    Flight::start(&folder, &["--preset", "tiny", "--seed", "8"]).finish_well();
+    let journal = journal(&folder);
+    assert!(journal.len() > 10, "{} lines", journal.len());
+    let stamps: Vec<u64> = journal.iter().filter_map(|line| line["now_ns"].as_u64()).collect();
+    assert_eq!(stamps.len(), journal.len(), "every line has a stamp");
+    assert!(stamps.is_sorted());
+    let numbers: BTreeSet<u64> = journal.iter().filter_map(|line| line["id"].as_u64()).collect();
+    assert_eq!(numbers.len(), journal.len(), "every line has a number of its own");
+    let text = fs::read_to_string(folder.join("journal.jsonl")).expect("journal");
+    assert!(!text.contains(folder.to_str().expect("utf8")), "no absolute path in the journal");
+}
