@@ -192,8 +192,18 @@ fn a_mission_that_is_over_stays_over() {
     assert!(mission.is_over());
 }
 
+#[test]
+fn a_planner_that_dies_between_touchdown_and_disarming_waits_for_the_disarming() {
+    let (calm, _) = fly(short(), Faults::default());
+    let last = calm.tick();
+    for before in [20, 100, 150, 190] {
+        let faults = Faults { restarts: BTreeMap::from([(last - before, 10)]), ..Faults::default() };
+        assert_eq!(fly(short(), faults).1, EndReason::Complete);
+    }
+}
+
 proptest::proptest! {
-    #![proptest_config(proptest::test_runner::Config::with_cases(5))]
+    #![proptest_config(proptest::test_runner::Config::with_cases(24))]
     #[test]
     fn after_deaths_every_keyframe_exists_once_and_the_choice_is_the_same(
         deaths in proptest::collection::btree_map(50u64..13_000, 1u64..400, 1..5),

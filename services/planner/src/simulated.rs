@@ -146,6 +146,10 @@ impl World {
         self.tick as f64 * 0.01
     }
 
+    pub fn tick(&self) -> u64 {
+        self.tick
+    }
+
     /// Flies until the mission is over; panics after `limit_s`.
     pub fn fly(&mut self, limit_s: f64) -> EndReason {
         while self.seconds() < limit_s {

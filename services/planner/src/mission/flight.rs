@@ -73,7 +73,8 @@ impl Mission {
     }
 
     fn on_the_ground(&mut self, vehicle: &VehicleState) -> State {
-        if vehicle.armed == 1 && self.flown {
+        // Touched down and not disarmed yet: after a restart on the way down nothing but the ending tells.
+        if vehicle.armed == 1 && (self.flown || self.ledger.ending.is_some()) {
             return State::Landing;
         }
         if self.ledger.ending.is_some() {
