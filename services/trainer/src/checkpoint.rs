@@ -52,6 +52,12 @@ pub struct Checkpoint {
 }
 
 impl Checkpoint {
+    /// What the last round that ended was asked; `None` before the first.
+    #[must_use]
+    pub fn last_round(&self) -> Option<&RoundSpec> {
+        self.progression.finished.last().map(|round| &round.spec)
+    }
+
     /// Puts the session where the checkpoint was taken. The caller then reads the keyframes
     /// ([`Session::resume`]).
     pub fn restore_into(self, session: &mut Session) {

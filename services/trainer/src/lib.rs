@@ -15,6 +15,7 @@ pub mod requests;
 pub mod round;
 pub mod session;
 pub mod state;
+pub mod untrained;
 pub mod worker;
 
 use std::time::Duration;

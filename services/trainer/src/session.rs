@@ -123,6 +123,12 @@ impl Session {
         &self.model
     }
 
+    /// The model alone.
+    #[must_use]
+    pub fn into_model(self) -> Gaussians {
+        self.model
+    }
+
     /// The renderer, for looking at the model.
     pub fn engine_and_model(&mut self) -> (&mut Engine, &Gaussians) {
         (&mut self.engine, &self.model)

@@ -92,10 +92,8 @@ pub fn measure(
     let views = views::held_out(&truth, effort)?;
     let quality = views::appearance(&truth, &gaussians, &views, effort)?;
     metrics.live.take(&quality);
-    let untrained = folder.model_path().join("init.ply");
-    if model.is_none() && untrained.is_file() {
-        let quality = views::appearance(&truth, &read_model(&untrained)?, &views, effort)?;
-        metrics.live.psnr_init_db = quality.object_db;
+    if let Some(untrained) = trainer::untrained::untrained(folder, config)? {
+        metrics.live.psnr_init_db = views::appearance(&truth, &untrained, &views, effort)?.object_db;
     }
     if let Some((least_m, collisions)) = truth.clearance(&track::read(&folder.report_path())) {
         metrics.mission.min_clearance_m = Some(least_m);

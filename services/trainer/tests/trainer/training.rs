@@ -1,10 +1,12 @@
 //! Training end to end, without IPC: quality on views that were not trained on, determinism, checkpoints.
 
 use crate::common::*;
-use shared_types::config::TrainerConfig;
+use shared_types::config::{Config, TrainerConfig};
+use shared_types::folder::MissionFolder;
 use trainer::checkpoint;
 use trainer::keyframes::KeyframeError;
 use trainer::session::Session;
+use trainer::untrained::untrained;
 
 /// Runs a round in slices of 20.
 fn train(session: &mut Session) -> u32 {
@@ -100,6 +102,30 @@ fn a_session_from_a_checkpoint_goes_on_with_the_same_bits() {
         }
         assert!(checkpoint::to_bytes(&resumed) == last);
     }
+}
+
+#[test]
+fn the_untrained_model_is_all_keyframes_of_the_last_round_inserted_at_once() {
+    let parent = tempfile::tempdir().unwrap();
+    let folder = MissionFolder::create(parent.path().join("mission")).unwrap();
+    for view in training_views((WIDTH, HEIGHT)) {
+        folder.write_keyframe(&view.keyframe).unwrap();
+    }
+    let config = Config { model: model_config(), ..Config::default() };
+    assert!(untrained(&folder, &config).unwrap().is_none(), "no round has ended");
+    let mut source = folder.clone();
+    let mut trained = session(config.trainer.clone(), 1);
+    for (round, ids) in [&[0u64, 2, 4][..], &[0, 2, 4, 1, 5]].into_iter().enumerate() {
+        trained.begin(spec(round as u32, 20, ids), &mut source).unwrap();
+        train(&mut trained);
+    }
+    checkpoint::write(&folder.model_path(), &trained).unwrap();
+    let mut inserted = session(config.trainer.clone(), 1);
+    inserted.begin(spec(0, 20, &[0, 2, 4, 1, 5]), &mut source).unwrap();
+    let found = untrained(&folder, &config).unwrap().unwrap();
+    let positions = |model: &splatting::Gaussians| model.iter().map(|g| g.mean.to_array()).collect::<Vec<_>>();
+    assert_eq!(positions(&found), positions(inserted.model()));
+    assert!(positions(&found) != positions(trained.model()), "training moves them");
 }
 
 #[test]
