@@ -17,6 +17,8 @@ const PROPERTIES: [&str; 14] = [
 ];
 /// Properties that are skipped.
 const NORMALS: [&str; 3] = ["nx", "ny", "nz"];
+/// Coefficients of SH degrees 1 to 3.
+const REST: &str = "f_rest_";
 /// A header longer than this is not one.
 const HEADER_MAX: usize = 16 << 10;
 
@@ -43,12 +45,23 @@ pub enum PlyError {
         name: &'static str,
     },
     /// A property that cannot be kept.
-    #[error("the PLY has a property \"{name}\" that would be lost: {advice}")]
+    #[error("the PLY has a property \"{name}\" that would be lost: remove it from the file")]
     Extra {
         /// The property.
         name: String,
-        /// What to do.
-        advice: &'static str,
+    },
+    /// View-dependent colour, which a model here has not.
+    #[error(
+        "Gaussian {index} of the PLY has view-dependent colour (\"{name}\" is {value}; expected 0): train or export the model \
+         with SH degree 0"
+    )]
+    ViewDependent {
+        /// Index from 0.
+        index: usize,
+        /// The property.
+        name: String,
+        /// The value, as text.
+        value: String,
     },
     /// The data does not have the length that the header gives.
     #[error("the PLY announces {count} Gaussians, {expected} bytes after its header, but {found} bytes follow: {}", if found < expected { "it is truncated" } else { "something else follows" })]
@@ -104,7 +117,7 @@ pub fn write(gaussians: &Gaussians, to: &mut impl Write) -> io::Result<()> {
 ///
 /// # Errors
 /// Where the file is not such a PLY, is truncated, or holds values that are not finite; nothing is skipped silently
-/// but normals and comments.
+/// but normals, comments and coefficients of higher SH degrees that are 0 (the original code always writes them).
 pub fn read(bytes: &[u8]) -> Result<Gaussians, PlyError> {
     let Header { count, properties, data } = parse_header(bytes)?;
     let mut columns = [0; PROPERTIES.len()];
@@ -116,12 +129,17 @@ pub fn read(bytes: &[u8]) -> Result<Gaussians, PlyError> {
     if expected != data.len() as u64 {
         return Err(PlyError::Length { count, expected, found: data.len() as u64 });
     }
+    let rest: Vec<usize> = (0..properties.len()).filter(|&at| properties[at].starts_with(REST)).collect();
     let mut model = Gaussians::new();
     for (index, row) in data.chunks_exact(stride).enumerate() {
-        let value = |property: usize| {
-            row.get(4 * columns[property]..).and_then(|b| b.first_chunk()).map_or(f32::NAN, |b| f32::from_le_bytes(*b))
+        let value = |column: usize| {
+            row.get(4 * column..).and_then(|b| b.first_chunk()).map_or(f32::NAN, |b| f32::from_le_bytes(*b))
         };
-        let v: [f32; PROPERTIES.len()] = std::array::from_fn(value);
+        if let Some(&lost) = rest.iter().find(|&&column| value(column) != 0.0) {
+            let name = properties[lost].clone();
+            return Err(PlyError::ViewDependent { index, name, value: value(lost).to_string() });
+        }
+        let v: [f32; PROPERTIES.len()] = std::array::from_fn(|property| value(columns[property]));
         let gaussian = Gaussian {
             mean: Vec3::new(v[0], v[1], v[2]),
             sh: [v[3], v[4], v[5]],
@@ -165,8 +183,8 @@ fn parse_header(bytes: &[u8]) -> Result<Header<'_>, PlyError> {
                 count = Some(n.parse().map_err(|_not_a_number| wrong("a number of vertices"))?);
             }
             (_, ["property", "float" | "float32", name]) if count.is_some() => {
-                if let Some(advice) = refused(name) {
-                    return Err(PlyError::Extra { name: (*name).to_owned(), advice });
+                if !(PROPERTIES.contains(name) || NORMALS.contains(name) || name.starts_with(REST)) {
+                    return Err(PlyError::Extra { name: (*name).to_owned() });
                 }
                 if properties.iter().any(|p| p == name) {
                     return Err(wrong("each property once"));
@@ -181,17 +199,6 @@ fn parse_header(bytes: &[u8]) -> Result<Header<'_>, PlyError> {
     let expected = "\"element vertex N\" before it";
     let count = count.ok_or(PlyError::Header { line, found: "end_header".to_owned(), expected })?;
     Ok(Header { count, properties, data: &bytes[end + END.len()..] })
-}
-
-/// Why a property is refused, if it is.
-fn refused(name: &str) -> Option<&'static str> {
-    if PROPERTIES.contains(&name) || NORMALS.contains(&name) {
-        None
-    } else if name.starts_with("f_rest_") {
-        Some("it is view-dependent colour (SH beyond degree 0); export the model with SH degree 0")
-    } else {
-        Some("remove it from the file")
-    }
 }
 
 #[cfg(test)]
@@ -234,6 +241,29 @@ mod tests {
     }
 
     #[test]
+    fn higher_sh_degrees_are_read_where_they_are_zero_and_refused_where_they_would_be_lost() {
+        let model = scene(4, 1);
+        let plain = bytes(&model);
+        let end = plain.windows(11).position(|w| w == b"end_header\n").unwrap();
+        let padded = |last: f32| {
+            let mut file = plain[..end].to_vec();
+            (0..45).for_each(|k| file.extend(format!("property float f_rest_{k}\n").bytes()));
+            file.extend(b"end_header\n");
+            for row in plain[end + 11..].chunks_exact(17 * 4) {
+                file.extend(row);
+                (0..45).for_each(|k| file.extend((if k == 44 { last } else { 0.0 }).to_le_bytes()));
+            }
+            file
+        };
+        assert_eq!(read(&padded(0.0)).unwrap(), model);
+        let message = read(&padded(0.25)).unwrap_err().to_string();
+        assert!(
+            message.contains("f_rest_44") && message.contains("0.25") && message.contains("SH degree 0"),
+            "{message}"
+        );
+    }
+
+    #[test]
     fn every_truncation_is_refused() {
         let bytes = bytes(&scene(4, 1));
         for length in 0..bytes.len() {
@@ -246,7 +276,6 @@ mod tests {
     fn errors_name_what_is_wrong() {
         let message = |bytes: &[u8]| read(bytes).unwrap_err().to_string();
         assert!(message(&with_header("property float opacity\n", "")).contains("\"opacity\""));
-        assert!(message(&with_header("float nx", "float f_rest_0")).contains("SH degree 0"));
         assert!(message(&with_header("float nx", "float density")).contains("\"density\""));
         assert!(message(&with_header("float nx", "uchar nx")).contains("type float"));
         assert!(message(&with_header("float ny", "float nx")).contains("once"));
