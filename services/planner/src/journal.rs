@@ -209,6 +209,8 @@ pub enum Record {
     Suspended,
     /// The operator said go on.
     GoOn,
+    /// The vehicle stands on the ground, disarmed, and flies no more.
+    Landed,
     /// No more views: going home.
     Ending {
         /// Why.

@@ -105,6 +105,8 @@ pub struct Ledger {
     pub ending: Option<(EndReason, bool)>,
     /// How it ended, and whether there is a model.
     pub over: Option<(EndReason, bool)>,
+    /// Whether the vehicle is back on the ground for good.
+    pub landed: bool,
     next_keyframe: u64,
 }
 
@@ -183,6 +185,7 @@ impl Ledger {
                 self.next_keyframe += shots.len() as u64;
                 self.batches.push(Batch { left: shots.clone() });
             }
+            Record::Landed => self.landed = true,
             Record::Suspended => self.suspended = true,
             Record::GoOn => self.suspended = false,
             Record::Ending { reason, land_here } => {

@@ -97,6 +97,37 @@ fn every_strategy_and_selector_completes() {
 }
 
 #[test]
+fn an_orbit_trains_after_every_view() {
+    for mode in [MissionMode::Serial, MissionMode::Concurrent] {
+        let planner =
+            PlannerConfig { strategy: Strategy::Orbit24, mode, stop_when_flat: false, ..PlannerConfig::default() };
+        let (world, end) = fly(planner, Faults::default());
+        assert_eq!((end, world.keyframes()), (EndReason::Complete, 24));
+        let rounds: Vec<u32> = world
+            .journal
+            .iter()
+            .filter_map(|entry| {
+                if let Record::Round { max_iterations, .. } = entry.record { Some(max_iterations) } else { None }
+            })
+            .collect();
+        assert_eq!(rounds, [500; 24], "the paper's 12K iterations");
+    }
+}
+
+#[test]
+fn a_mission_whose_every_seed_view_fails_comes_home_at_once() {
+    let (world, end) = fly(short(), Faults { failing_capture: 1, failing_after: 2, ..Faults::default() });
+    assert_eq!((end, world.keyframes()), (EndReason::NoCandidates, 0));
+    assert!(world.seconds() < 200.0, "{}", world.seconds());
+}
+
+#[test]
+fn a_pilot_takes_his_time_to_arm() {
+    let (world, end) = fly(short(), Faults { arming_ticks: 30_000, ..Faults::default() });
+    assert_eq!((end, world.keyframes()), (EndReason::Complete, 14));
+}
+
+#[test]
 fn the_same_seed_writes_the_same_journal() {
     let (a, _) = fly(short(), Faults::default());
     let (b, _) = fly(short(), Faults::default());

@@ -30,6 +30,10 @@ const TICK_NS: u64 = 10_000_000;
 pub struct Faults {
     /// Every so-many-th capture fails; 0: none.
     pub failing_capture: u64,
+    /// But not the first ones.
+    pub failing_after: u64,
+    /// Ticks that arming takes beyond the usual; meanwhile px4-link says that it works on it.
+    pub arming_ticks: u64,
     /// The planner dies at these ticks, and lives again after so many ticks.
     pub restarts: BTreeMap<u64, u64>,
     /// px4-link dies at these ticks: it forgets the target, and flies again after a second.
@@ -372,8 +376,12 @@ impl World {
         let v = &mut self.vehicle;
         let confirmed = match command {
             VehicleCommand::Arm => {
-                v.armed = 1;
-                self.tick > since + 50
+                let armed = self.tick > since + 50 + self.faults.arming_ticks;
+                v.armed = u32::from(armed);
+                if !armed && (self.tick - since).is_multiple_of(100) {
+                    self.answer(id, CommandStatus::Accepted);
+                }
+                armed
             }
             VehicleCommand::Takeoff => {
                 v.mode = FlightMode::Takeoff.code();
@@ -530,7 +538,8 @@ impl World {
         };
         if !self.stored.0.contains_key(&key) {
             self.capture_count += 1;
-            if self.faults.failing_capture > 0 && self.capture_count.is_multiple_of(self.faults.failing_capture) {
+            let failing = self.faults.failing_capture > 0 && self.capture_count > self.faults.failing_after;
+            if failing && self.capture_count.is_multiple_of(self.faults.failing_capture) {
                 reply.status = CaptureStatus::TimedOut.code();
                 self.replies.push((self.tick + 300, Reply::Capture(id, reply)));
                 return;

@@ -6,6 +6,8 @@ use std::path::Path;
 use toml::de::{DeTable, DeValue};
 
 use super::Config;
+use super::planner::GNSS_CLEARANCE_M;
+use super::simulator::EstimatorName;
 
 /// The presets: name and the TOML laid over the defaults.
 pub const PRESETS: &[(&str, &str)] = &[
@@ -242,11 +244,15 @@ pub fn load(layers: &[Layer]) -> Result<Config, ConfigError> {
         overlay(&mut merged, layer.check()?);
     }
     let text = merged.to_string();
-    let config: Config = toml::from_str(&text).map_err(|error| ConfigError::Syntax {
+    let mut config: Config = toml::from_str(&text).map_err(|error| ConfigError::Syntax {
         place: "configuration".to_owned(),
         key: String::new(),
         message: error.message().to_owned(),
     })?;
+    let chosen = layers.iter().any(|layer| layer.place_of("planner.clearance_m").is_some());
+    if !chosen && config.simulator.estimator == EstimatorName::Gnss {
+        config.planner.clearance_m = GNSS_CLEARANCE_M;
+    }
     let lines: Vec<String> = config
         .problems()
         .into_iter()
@@ -357,6 +363,17 @@ mod tests {
         let paper = preset("paper").expect("paper");
         assert_eq!(paper.trainer, super::super::TrainerConfig::paper());
         assert_eq!(paper.planner, super::super::PlannerConfig::paper());
+    }
+
+    #[test]
+    fn gnss_keeps_a_greater_distance_unless_one_was_chosen() {
+        let clearance = |sets: &[&str]| {
+            let layers: Vec<Layer> = sets.iter().map(|set| Layer::of_set(set).expect("set")).collect();
+            load(&layers).expect("valid").planner.clearance_m
+        };
+        assert_eq!(clearance(&["simulator.estimator=vio"]), 0.72);
+        assert_eq!(clearance(&["simulator.estimator=gnss"]), 0.92);
+        assert_eq!(clearance(&["simulator.estimator=gnss", "planner.clearance_m=0.8"]), 0.8);
     }
 
     #[test]

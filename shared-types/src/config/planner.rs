@@ -88,14 +88,15 @@ pub enum RadiusRule {
     Paper,
 }
 
+/// `clearance_m` where nothing better than plain GNSS tells where the vehicle is, metres.
+pub const GNSS_CLEARANCE_M: f64 = 0.92;
+
 /// Section `[planner]`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct PlannerConfig {
     /// Begin as soon as everything is ready; else wait for the command to start.
     pub autostart: bool,
-    /// A pilot arms the motors; else Vantage does.
-    pub pilot_arms: bool,
     /// What decides where to fly: nbv, orbit24, orbit48 or orbit-look-at.
     pub strategy: Strategy,
     /// What chooses the views of a round: depth-variance, uncertainty-only, angle-only, fibonacci-order or random.
@@ -149,7 +150,7 @@ pub struct PlannerConfig {
     /// Lowest altitude of a camera above the ground, metres.
     pub lowest_altitude_m: f64,
     /// Least distance of the vehicle's centre from the box, metres: 0.37 (X500's rotor tips) + 0.10 (exact, VIO, RTK) or
-    /// 0.30 (GNSS) + 0.25.
+    /// 0.30 (GNSS) + 0.25. Not given, and with simulator.estimator = "gnss": 0.92.
     pub clearance_m: f64,
     /// Kept besides away from the ends of a path, for blended corners, metres.
     pub path_margin_m: f64,
@@ -212,7 +213,6 @@ impl Default for PlannerConfig {
     fn default() -> Self {
         Self {
             autostart: true,
-            pilot_arms: false,
             strategy: Strategy::Nbv,
             selector: SelectorName::DepthVariance,
             variance: VarianceMode::Normalised,
@@ -311,7 +311,7 @@ impl Section for PlannerConfig {
             ("score_height_px", f64::from(self.score_height_px), 16.0, 4096.0),
             ("batch", f64::from(self.batch), 1.0, 6.0),
             ("keyframes", f64::from(self.keyframes), 1.0, 400.0),
-            ("seed_views", f64::from(self.seed_views), 1.0, 24.0),
+            ("seed_views", f64::from(self.seed_views), 1.0, 8.0),
             ("survey_point_m[0]", self.survey_point_m[0], -1e5, 1e5),
             ("survey_point_m[1]", self.survey_point_m[1], -1e5, 1e5),
             ("survey_point_m[2]", self.survey_point_m[2], -1e4, 1e4),

@@ -178,6 +178,8 @@ impl TrainerConfig {
     pub fn paper() -> Self {
         Self {
             voxel_m: 0.01,
+            sigma_min_voxels: 0.0,
+            sigma_max_voxels: 1000.0,
             birth_shape: BirthShape::Isotropic,
             weight_depth: 0.5,
             weight_isotropic: 0.1,

@@ -77,11 +77,12 @@ const STEP_M: f64 = 0.01;
 const GROWTH: f64 = 0.5;
 
 impl FreeSpace {
-    /// Free space about a known box. `camera_reach_m` is how far below the vehicle's centre its camera may be.
+    /// Free space about a known box. `camera_drop_m` is how far below the vehicle's centre its camera is at least: the
+    /// lowest altitude is the camera's.
     #[must_use]
-    pub fn around_prior(prior: &Prior, volume: Volume, camera_reach_m: f64, config: &PlannerConfig) -> Self {
+    pub fn around_prior(prior: &Prior, volume: Volume, camera_drop_m: f64, config: &PlannerConfig) -> Self {
         let obstacle = Obstacle { center_m: prior.center(), half_m: DVec3::splat(prior.size_m / 2.0) };
-        Self::new(obstacle, prior.ground_z_m() - camera_reach_m, volume, config)
+        Self::new(obstacle, prior.ground_z_m() + camera_drop_m, volume, config)
     }
 
     /// Free space before the prior is known: wherever the object may be is forbidden, up to the greatest box's height.

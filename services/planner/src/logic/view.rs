@@ -50,10 +50,11 @@ impl Mount {
             * (self.pivot_in_body_m + DQuat::from_rotation_y(-pitch_rad) * self.camera_in_payload_m)
     }
 
-    /// Longest distance of the camera from the body's origin, metres.
+    /// How far the camera is below the body's origin at least, whatever the payload's pitch, metres; negative above it.
     #[must_use]
-    pub fn reach_m(&self) -> f64 {
-        self.pivot_in_body_m.length() + self.camera_in_payload_m.length()
+    pub fn least_drop_m(&self) -> f64 {
+        let payload = self.camera_in_payload_m;
+        -self.pivot_in_body_m.z - payload.x.hypot(payload.z)
     }
 }
 

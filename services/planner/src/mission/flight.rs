@@ -182,8 +182,9 @@ impl Mission {
             })
             .collect();
         // The way back counts where it follows: after the last batch. Before, it would draw every batch's end homeward.
+        let planned = self.ledger.taken.len() + self.ledger.left().count();
         let last =
-            self.ledger.taken.len() + self.ledger.left().count() >= self.setup.planner.keyframes_wanted() as usize;
+            planned >= self.setup.planner.keyframes_wanted() as usize && self.ledger.left().count() == aims.len();
         let home: Vec<f64> = match self.return_point().filter(|_| last) {
             Some(point) => aims.iter().map(|from| cost(self.route(from.body_m, point), 0.0, 0.0)).collect(),
             None => vec![0.0; aims.len()],

@@ -54,6 +54,8 @@ struct Pending {
     id: u64,
     command: VehicleCommand,
     since_ns: u64,
+    /// px4-link works on it.
+    accepted: bool,
     answer: Option<Result<(), String>>,
 }
 
@@ -308,8 +310,10 @@ impl Mission {
     fn ensure(&mut self, command: VehicleCommand, altitude_m: f64) -> Option<Result<(), String>> {
         if let Some(pending) = &mut self.pending {
             if pending.command == command {
-                let (id, late) =
-                    (pending.id, self.now_ns > pending.since_ns + ns_from_s(self.setup.planner.command_deadline_s));
+                // A pilot who is to arm takes the time he needs.
+                let waits_for_pilot = command == VehicleCommand::Arm && pending.accepted;
+                let overdue = self.now_ns > pending.since_ns + ns_from_s(self.setup.planner.command_deadline_s);
+                let (id, late) = (pending.id, overdue && !waits_for_pilot);
                 let answer = pending.answer.take().or_else(|| late.then(|| Err("no answer in time".to_owned())));
                 let answer = answer?;
                 self.pending = None;
@@ -329,7 +333,7 @@ impl Mission {
         }
         if self.now_ns >= self.retry_ns {
             let id = self.record(Record::Command { command, altitude_m });
-            self.pending = Some(Pending { id, command, since_ns: self.now_ns, answer: None });
+            self.pending = Some(Pending { id, command, since_ns: self.now_ns, accepted: false, answer: None });
             let request = CommandRequest { command: command.code(), reserved: 0, altitude_m };
             self.out.effects.push(Effect::Command(id, request));
         }
@@ -346,7 +350,8 @@ impl Mission {
                 self.pending = None;
                 self.out.effects.push(Effect::CommandOver(id));
             }
-            Some(CommandStatus::Accepted) | None => {}
+            Some(CommandStatus::Accepted) => pending.accepted = true,
+            None => {}
         }
     }
 
@@ -366,7 +371,7 @@ impl Mission {
         let (space, candidates) = match &self.ledger.prior {
             None => (FreeSpace::around_survey(survey_m, volume, config), Candidates::default()),
             Some((prior, limits)) => {
-                let space = FreeSpace::around_prior(prior, volume, self.mount.reach_m(), config);
+                let space = FreeSpace::around_prior(prior, volume, self.mount.least_drop_m(), config);
                 let limits = crate::logic::candidates::PitchLimits { min_rad: limits[0], max_rad: limits[1] };
                 let candidates = crate::logic::candidates::generate(prior, &space, &self.mount, limits, config);
                 (space, candidates)
@@ -391,10 +396,12 @@ impl Mission {
     fn count_coverage(&mut self, views: &mut dyn Views) {
         let Some((prior, _)) = &self.ledger.prior else { return };
         for taken in &self.ledger.taken {
-            if self.counted.insert(taken.shot.keyframe_id)
-                && let Some((view, _)) = views.read(KeyframeReason::Selected, taken.shot.keyframe_id)
+            let id = taken.shot.keyframe_id;
+            if !self.counted.contains(&id)
+                && let Some((view, _)) = views.read(KeyframeReason::Selected, id)
             {
                 self.coverage.add(&view, prior, self.setup.planner.coverage_points);
+                self.counted.insert(id);
             }
         }
     }

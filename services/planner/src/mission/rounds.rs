@@ -129,13 +129,21 @@ impl Mission {
         }
     }
 
+    /// Views that may still be chosen for the next batch.
+    fn quota(&self) -> usize {
+        let planned = self.ledger.taken.len() + self.ledger.left().count();
+        (self.setup.planner.keyframes_wanted() as usize).saturating_sub(planned).min(self.setup.planner.batch as usize)
+    }
+
     fn choose_batch(&mut self) {
         let Some((prior, limits)) = self.ledger.prior else { return };
         if self.ledger.ending.is_some() {
             return;
         }
         self.ensure_terrain();
-        let Some(terrain) = &self.terrain else { return };
+        if self.terrain.is_none() {
+            return;
+        }
         if let Some(asked) = self.ledger.asked.clone() {
             if self.score_sent != Some(asked.request) {
                 let (request, views) = self.score_request(&asked, &prior);
@@ -148,41 +156,25 @@ impl Mission {
         let config = &self.setup.planner;
         let batch = self.ledger.batches.len();
         let limits = PitchLimits { min_rad: limits[0], max_rad: limits[1] };
-        if batch == 0 && config.strategy == Strategy::Nbv {
+        if config.strategy != Strategy::Nbv {
+            self.choose_orbit_view(&prior, limits);
+            return;
+        }
+        if batch == 0 {
             let seeds = seed_orbit(&prior, limits, config);
             self.select_views(&seeds, KeyframeReason::Seed, 0);
             return;
         }
-        let planned = self.ledger.taken.len() + self.ledger.left().count();
-        let quota = (config.keyframes_wanted() as usize).saturating_sub(planned).min(config.batch as usize);
-        let mut generation = 0;
-        if batch > 0 {
-            let serial = config.mode == MissionMode::Serial;
-            let done = self.ledger.rounds.get(self.needed_round(batch)).and_then(|round| round.generation);
-            match done {
-                Some(known) if !serial || self.ledger.batches_flown() >= batch => generation = known,
-                _ => return,
-            }
-        }
-        if quota == 0 {
+        if self.ledger.taken.is_empty() && self.ledger.left().next().is_none() {
+            // Every seed view was given up: there is nothing to train on, so nothing to choose by.
+            self.end(EndReason::NoCandidates);
             return;
         }
-        if config.strategy != Strategy::Nbv {
-            // The circle begins where the vehicle comes from.
-            let from = terrain.home_m - prior.center();
-            let orbit = orbit::views(&prior, limits, from.y.atan2(from.x), config);
-            let begun = usize::try_from(self.ledger.next_keyframe()).unwrap_or(usize::MAX);
-            let next: Vec<View> = orbit.into_iter().skip(begun).take(quota).collect();
-            if next.is_empty() {
-                // Views that were given up are not replaced: the circles are flown.
-                if self.ledger.left().next().is_none() {
-                    let reason =
-                        if self.ledger.taken.is_empty() { EndReason::NoCandidates } else { EndReason::Complete };
-                    self.end(reason);
-                }
-                return;
-            }
-            self.select_views(&next, KeyframeReason::Selected, generation);
+        let serial = config.mode == MissionMode::Serial;
+        let done = self.ledger.rounds.get(self.needed_round(batch)).and_then(|round| round.generation);
+        let Some(generation) = done.filter(|_| !serial || self.ledger.batches_flown() >= batch) else { return };
+        let quota = self.quota();
+        if quota == 0 {
             return;
         }
         let free: Vec<u32> = self.free().iter().map(|candidate| candidate.index).collect();
@@ -201,6 +193,28 @@ impl Mission {
             self.record(Record::Score { batch: number, generation, free, visited_m });
         } else {
             self.select(&visited_m, &[], quota, generation, 0.0);
+        }
+    }
+
+    /// The next view of an orbit, once the one before is flown; serial: and trained. Each is a batch of its own, as a round
+    /// begins when a keyframe is queued (Section IV-F: the paper's 12K iterations are 24 rounds of 500). Views that were
+    /// given up are not replaced: the circles are flown.
+    fn choose_orbit_view(&mut self, prior: &Prior, limits: PitchLimits) {
+        let Some(terrain) = &self.terrain else { return };
+        let config = &self.setup.planner;
+        let trains = self.ledger.training().is_some() || self.round_due().is_some();
+        if self.ledger.left().next().is_some() || (config.mode == MissionMode::Serial && trains) {
+            return;
+        }
+        // The circle begins where the vehicle comes from.
+        let from = terrain.home_m - prior.center();
+        let orbit = orbit::views(prior, limits, from.y.atan2(from.x), config);
+        let begun = usize::try_from(self.ledger.next_keyframe()).unwrap_or(usize::MAX);
+        match orbit.get(begun).copied() {
+            Some(next) if self.quota() > 0 => self.select_views(&[next], KeyframeReason::Selected, 0),
+            Some(_) => {}
+            None if self.ledger.taken.is_empty() => self.end(EndReason::NoCandidates),
+            None => self.end(EndReason::Complete),
         }
     }
 
@@ -324,8 +338,11 @@ impl Mission {
 
     fn score_answered(&mut self, id: u64, reply: &ScoreReply, scores: &[CandidateScore]) {
         let Some(asked) = self.ledger.asked.clone().filter(|asked| asked.request == id) else { return };
-        self.progress_ns = self.now_ns;
-        match ScoreStatus::from_code(reply.status) {
+        let status = ScoreStatus::from_code(reply.status);
+        if status != Some(ScoreStatus::Waiting) {
+            self.progress_ns = self.now_ns;
+        }
+        match status {
             Some(ScoreStatus::Done) => {
                 self.out.effects.push(Effect::ScoreOver(id));
                 self.ensure_terrain();
@@ -335,9 +352,7 @@ impl Mission {
                     self.end(EndReason::NothingToGain);
                     return;
                 }
-                let planned = self.ledger.taken.len() + self.ledger.left().count();
-                let quota = (config.keyframes_wanted() as usize).saturating_sub(planned).min(config.batch as usize);
-                self.select(&asked.visited_m, scores, quota, reply.generation, reply.uncertainty_p95);
+                self.select(&asked.visited_m, scores, self.quota(), reply.generation, reply.uncertainty_p95);
             }
             Some(ScoreStatus::GenerationGone) => {
                 self.out.effects.push(Effect::ScoreOver(id));

@@ -61,7 +61,7 @@ impl Mission {
         }
         let limits = self.pitch_limits(vehicle);
         let candidates = self.terrain.as_ref().map(|terrain| {
-            let space = FreeSpace::around_prior(&prior, terrain.space.volume, self.mount.reach_m(), config);
+            let space = FreeSpace::around_prior(&prior, terrain.space.volume, self.mount.least_drop_m(), config);
             generate(&prior, &space, &self.mount, limits, config)
         });
         let candidates = candidates.unwrap_or_default();

@@ -134,9 +134,6 @@ impl Mission {
         }
         let taking_off = self.pending.as_ref().is_some_and(|pending| pending.command == VehicleCommand::Takeoff);
         let command = if grounded && vehicle.armed == 0 && !taking_off {
-            if self.setup.planner.pilot_arms {
-                return State::Launching;
-            }
             VehicleCommand::Arm
         } else if grounded || taking_off {
             VehicleCommand::Takeoff
@@ -223,6 +220,9 @@ impl Mission {
     }
 
     pub(super) fn finishing(&mut self) -> State {
+        if self.ledger.airborne.is_some() && !self.ledger.landed && self.on_ground() {
+            self.record(Record::Landed);
+        }
         let waiting = self.ledger.training().is_some() || self.round_due().is_some();
         let overdue = self.now_ns > self.progress_ns.saturating_add(ns_from_s(self.setup.planner.service_deadline_s));
         if waiting && !self.trainer_failed && !overdue {
