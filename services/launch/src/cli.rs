@@ -175,10 +175,10 @@ pub struct Doctor {
 pub struct Evaluate {
     /// The mission folder.
     pub folder: PathBuf,
-    /// Held-out views per radius, at most 100; default: launch.evaluate_views.
+    /// Held-out views, both radii together; default: launch.evaluate_views. Other numbers than the default are only printed.
     #[arg(long, value_name = "N")]
     pub views: Option<u32>,
-    /// Width of the held-out views, pixels (4:3); default: launch.evaluate_width.
+    /// Width of the held-out views, pixels; default: model.width. Another than the default is only printed.
     #[arg(long, value_name = "PIXELS")]
     pub width: Option<u32>,
     /// Model to measure instead of the mission's own (INRIA PLY).

@@ -37,6 +37,7 @@ pub fn table(metrics: &Metrics, folder: &Path) -> String {
         ("coverage, paper".to_owned(), percent(metrics.coverage.paper)),
         ("surface seen twice, of the feasible".to_owned(), percent(metrics.coverage.cov2_feasible)),
         ("area under that curve".to_owned(), percent(metrics.coverage.auc)),
+        ("F-score at 1 % of the diameter".to_owned(), percent(metrics.geometry.f_score_1pct)),
         ("memory, all services".to_owned(), metrics.memory.get("total_pss_mb").map(|mb| format!("{mb:.0} MB"))),
         ("restarts".to_owned(), (!restarts.is_empty()).then(|| restarts.join(", "))),
         ("repeats bit for bit".to_owned(), mission.deterministic.map(|yes| if yes { "yes" } else { "no" }.to_owned())),

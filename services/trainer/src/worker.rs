@@ -212,6 +212,10 @@ impl Thread {
         if let Some(last_final) = checkpoint::newest(&self.model_folder, true) {
             last_final.restore_into(&mut self.session);
             snapshot = self.session.snapshot();
+            // A kill between a round's checkpoint and its model files leaves those of the round before: written again.
+            if let Some(round) = self.session.finished().last().map(|finished| finished.spec.round) {
+                self.write_models(round);
+            }
         }
         if let Some(newest) = checkpoint::newest(&self.model_folder, false) {
             newest.restore_into(&mut self.session);
@@ -247,9 +251,7 @@ impl Thread {
         if let Err(error) = checkpoint::write(&self.model_folder, &self.session) {
             return self.send(Output::Failed { round, reason: error.to_string() });
         }
-        if let Err(error) = write_models(&self.model_folder, &self.session, round) {
-            tracing::warn!(error, "cannot write the model of a round; its checkpoint is written");
-        }
+        self.write_models(round);
         match (self.session.finished().last().cloned(), self.session.snapshot()) {
             (Some(round), Some(snapshot)) => self.send(Output::Finished { round, snapshot }),
             _ => self.send(Output::Failed { round, reason: "the round left no result".to_owned() }),
@@ -313,6 +315,12 @@ impl Thread {
                 let asked = if snapshot { &self.signals.snapshot } else { &self.signals.checkpoint };
                 asked.swap(false, Ordering::Relaxed)
             }
+        }
+    }
+
+    fn write_models(&self, round: u32) {
+        if let Err(error) = write_models(&self.model_folder, &self.session, round) {
+            tracing::warn!(error, "cannot write the model of a round; its checkpoint is written");
         }
     }
 

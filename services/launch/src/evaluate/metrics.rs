@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
 use shared_types::config::Config;
-use world::truth::Coverage as TrueCoverage;
+use world::truth::{Coverage as TrueCoverage, Geometry as Distances};
 
 use super::flight::FlightRecord;
 use super::journal::Journal;
@@ -19,6 +19,9 @@ pub struct Metrics {
     pub live: Live,
     /// What was seen of the object.
     pub coverage: Coverage,
+    /// How near the model is to the true surface.
+    #[serde(default)]
+    pub geometry: Geometry,
     /// Where the mission's time went.
     pub timing: Timing,
     /// `<service>_pss_mb`, `total_pss_mb`, `model_mb`: megabytes.
@@ -122,13 +125,27 @@ optional_figures! {
 }
 
 optional_figures! {
-    /// `timing.*`, mission time.
+    /// `geometry.*`: centres of the Gaussians that are more than half opaque, beside the true surface.
+    pub struct Geometry {
+        /// Mean distance of the centres from the surface, metres.
+        pub accuracy_m: f64,
+        /// Mean distance of the feasible surface from the nearest centre, metres.
+        pub completeness_m: f64,
+        /// F-score at 1 % of the object's diameter, 0 to 1.
+        pub f_score_1pct: f64,
+        /// Mean of accuracy and completeness, metres.
+        pub chamfer_m: f64,
+    }
+}
+
+optional_figures! {
+    /// `timing.*`, mission time. The first four do not overlap; together they are the time from takeoff to the end.
     pub struct Timing {
-        /// In the air between views, seconds.
+        /// In the air and under way, seconds.
         pub flight_s: f64,
         /// Taking views, seconds.
         pub capture_s: f64,
-        /// Waiting for training, seconds.
+        /// Waiting for training, in the air or on the ground, seconds.
         pub training_s: f64,
         /// Waiting for scores, seconds.
         pub scoring_s: f64,
@@ -183,17 +200,18 @@ impl Metrics {
             psnr_train_db: journal.psnr_train_db.or(flight.psnr_train_db).and_then(positive),
             ..Live::default()
         };
-        let coverage = Coverage { paper: flight.paper_coverage.and_then(positive), ..Coverage::default() };
+        let coverage =
+            Coverage { paper: flight.paper_coverage.filter(|share| share.is_finite()), ..Coverage::default() };
         let rate = |iterations: u32, training_s: f64| positive(f64::from(iterations) / training_s);
         let timing = Timing {
             flight_s: journal.flight_s,
             capture_s: journal.capture_s,
             training_s: journal.training_s,
             scoring_s: journal.scoring_s,
-            iterations_per_s: journal.iterations.zip(journal.training_s).and_then(|(count, time)| rate(count, time)),
+            iterations_per_s: journal.iterations.zip(journal.rounds_s).and_then(|(count, time)| rate(count, time)),
             ..Timing::default()
         };
-        Self { mission, live, coverage, timing, memory: flight.memory.clone() }
+        Self { mission, live, coverage, geometry: Geometry::default(), timing, memory: flight.memory.clone() }
     }
 }
 
@@ -205,6 +223,16 @@ impl Live {
         self.psnr_frame_db = quality.frame_db;
         self.ssim_object = quality.ssim_object;
         self.psnr_null_db = quality.null_db;
+    }
+}
+
+impl Geometry {
+    /// Takes the distances, with the F-score at one threshold.
+    pub fn take(&mut self, distances: &Distances) {
+        self.accuracy_m = Some(distances.accuracy_m);
+        self.completeness_m = Some(distances.completeness_m);
+        self.f_score_1pct = distances.f_scores.first().map(|(_, score)| *score);
+        self.chamfer_m = Some(distances.chamfer_m);
     }
 }
 

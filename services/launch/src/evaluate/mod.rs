@@ -51,7 +51,8 @@ impl Effort {
 pub fn run(arguments: &Evaluate) -> anyhow::Result<Exit> {
     let folder = MissionFolder::open(&arguments.folder)?;
     let config = load(&[Layer::of_file(&folder.config_path())?])?;
-    let mut effort = Effort::of(&config);
+    let official = Effort::of(&config);
+    let mut effort = official;
     if let Some(views) = arguments.views {
         effort.views = views.clamp(2, 1000) as usize;
     }
@@ -60,8 +61,8 @@ pub fn run(arguments: &Evaluate) -> anyhow::Result<Exit> {
         effort.height = (effort.width * config.camera.height_px).div_ceil(config.camera.width_px.max(1)).max(1);
     }
     let metrics = measure(&folder, &config, effort, arguments.model.as_deref())?;
-    // Figures of another model are not the mission's.
-    if arguments.model.is_none() {
+    // Figures of another model, or of other views than every mission is measured on, are not the mission's.
+    if arguments.model.is_none() && effort == official {
         write_metrics(&folder, &metrics)?;
     }
     print(&if arguments.json { to_json(&metrics)? } else { summary::table(&metrics, folder.root()) })
@@ -81,7 +82,7 @@ pub fn measure(
     let gaussians = read_model(model.unwrap_or(&own))?;
     let mut metrics = Metrics::of_folder(config, &flight::read(folder)?, &journal::read(&folder.journal_path())?);
     metrics.live.gaussians = Some(gaussians.len());
-    metrics.memory.insert("model_mb".to_owned(), file_mb(&own));
+    metrics.memory.insert("model_mb".to_owned(), model_mb(&gaussians));
     let poses = keyframe_poses(folder)?;
     metrics.mission.keyframes.get_or_insert(poses.len());
     if !config.link.is_local() {
@@ -95,31 +96,40 @@ pub fn measure(
     if let Some(untrained) = trainer::untrained::untrained(folder, config)? {
         metrics.live.psnr_init_db = views::appearance(&truth, &untrained, &views, effort)?.object_db;
     }
-    if let Some((least_m, collisions)) = truth.clearance(&track::read(&folder.report_path())) {
+    let flown_m = track::read(&folder.report_path());
+    if let Some((least_m, collisions)) = truth.clearance(&flown_m) {
         metrics.mission.min_clearance_m = Some(least_m);
         metrics.mission.collisions = Some(collisions);
+        metrics.mission.path_m = Some(track::length_m(&flown_m));
     }
-    metrics.coverage.take(&truth.coverage(&poses));
+    let (coverage, geometry) = truth.surface(&poses, &gaussians);
+    metrics.coverage.take(&coverage);
+    if let Some(geometry) = geometry {
+        metrics.geometry.take(&geometry);
+    }
     if model.is_none() {
         pictures::write(folder, &truth, &gaussians)?;
     }
     Ok(metrics)
 }
 
-fn file_mb(path: &Path) -> f64 {
-    #[expect(clippy::cast_precision_loss, reason = "file sizes are far below 2^53")]
-    let bytes = std::fs::metadata(path).map_or(0.0, |data| data.len() as f64);
+/// Memory of a model's parameters, megabytes: 14 numbers of 4 bytes, an id and the round of its birth each. Training holds
+/// two moments of each number besides.
+fn model_mb(gaussians: &Gaussians) -> f64 {
+    #[expect(clippy::cast_precision_loss, reason = "far below 2^53")]
+    let bytes = (gaussians.len() * (14 * 4 + 8 + 4)) as f64;
     (bytes / 1e5).round() / 10.0
 }
 
-/// Measured poses of the keyframes, in the order of their ids.
+/// Measured poses of the keyframes, in the order of their capture: ids follow the order of choice, and a batch is flown in
+/// another.
 fn keyframe_poses(folder: &MissionFolder) -> Result<Vec<Pose>, FolderError> {
-    let mut poses = Vec::new();
+    let mut frames = Vec::new();
     for id in folder.list_keyframes()? {
-        let frame = folder.read_frame(shared_types::messages::KeyframeReason::Selected, id)?;
-        poses.extend(frame.map(|frame| frame.world_from_camera()));
+        frames.extend(folder.read_frame(shared_types::messages::KeyframeReason::Selected, id)?);
     }
-    Ok(poses)
+    frames.sort_by_key(|frame| frame.stamp_ns);
+    Ok(frames.iter().map(|frame| frame.world_from_camera()).collect())
 }
 
 /// Reads a model.

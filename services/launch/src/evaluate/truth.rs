@@ -1,17 +1,22 @@
 //! The world that was flown in, rebuilt for judging: the same scene, held-out views, and coverage of the true surface.
 
-use glam::DVec3;
+use glam::{DVec3, Vec3};
 use shared_types::config::Config;
 use shared_types::config::planner::PlannerConfig;
 use shared_types::frames::{Intrinsics, Pose};
+use splatting::Gaussians;
 use world::render::{RenderOptions, RgbdImage, Threads, render};
-use world::truth::{Coverage, CoverageMeter, HeldOutRules, HeldOutView, SurfaceSamples, ViewLimits, held_out_views};
+use world::truth::{
+    Coverage, CoverageMeter, Geometry, HeldOutRules, HeldOutView, SurfaceSamples, ViewLimits, compare, held_out_views,
+};
 use world::{Scene, SceneConfig};
 
 use crate::exit::Refusal;
 
 /// Samples of the true surface (the evaluation protocol's number).
 const SURFACE_SAMPLES: usize = 20_000;
+/// Threshold of the F-score as a share of the object's diameter.
+const F_SCORE_SHARE: f64 = 0.01;
 /// Seed of the samples: the same for every mission over an object.
 const SAMPLE_SEED: u64 = 1;
 /// Below this the vehicle stands, starts or lands, metres.
@@ -132,14 +137,26 @@ impl Truth {
         Some((least, began + usize::from(distances.first().is_some_and(touching))))
     }
 
-    /// Coverage of the true surface by views in their order.
+    /// Coverage of the true surface by views in their order, and how near the model is to it: the centres of Gaussians that
+    /// are more than half opaque, those left out that are nearer to the ground than to the object. Completeness asks for what
+    /// some view could have seen.
     #[must_use]
-    pub fn coverage(&self, poses: &[Pose]) -> Coverage {
+    pub fn surface(&self, poses: &[Pose], gaussians: &Gaussians) -> (Coverage, Option<Geometry>) {
         let threads = Threads::new(cores());
+        let index = self.scene.index();
         let samples = SurfaceSamples::new(self.scene.mesh(), SURFACE_SAMPLES, SAMPLE_SEED);
         let shell = (self.center_m, self.radius_m, self.lowest_m);
-        CoverageMeter::new(self.scene.index(), &samples, ViewLimits::new(self.capture), shell, &threads)
-            .measure(poses, &threads)
+        let meter = CoverageMeter::new(index, &samples, ViewLimits::new(self.capture), shell, &threads);
+        let solid: Vec<Vec3> = gaussians
+            .iter()
+            .filter(|gaussian| gaussian.opacity_logit > 0.0 && gaussian.mean.is_finite())
+            .map(|gaussian| gaussian.mean)
+            .filter(|mean| index.distance_m(*mean) <= mean.z.abs())
+            .collect();
+        let feasible = samples.only(meter.feasible_once());
+        let diameter_m = (self.bounds_m.1 - self.bounds_m.0).length();
+        let geometry = compare(&solid, index, &feasible, &[F_SCORE_SHARE * diameter_m], &threads);
+        (meter.measure(poses, &threads), geometry)
     }
 }
 

@@ -11,6 +11,8 @@ use shared_types::messages::Truth;
 
 /// Mission time between points.
 const PERIOD_NS: u64 = 50_000_000;
+/// No vehicle of ours flies so far in that time.
+const LARGEST_STEP_M: f64 = 1.0;
 const HEADING: &str = "mission_s,x_m,y_m,z_m\n";
 
 /// Points of a run.
@@ -71,6 +73,12 @@ pub fn read(report: &Path) -> Vec<DVec3> {
         .collect()
 }
 
+/// Length of a track, metres. A jump to where the next run of a mission began is no part of it.
+#[must_use]
+pub fn length_m(points: &[DVec3]) -> f64 {
+    points.windows(2).map(|pair| (pair[1] - pair[0]).length()).filter(|step| *step < LARGEST_STEP_M).sum()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -92,5 +100,6 @@ mod tests {
         assert_eq!(points.len(), 8, "every fifth tick of two runs");
         assert_eq!(points[5], DVec3::new(5.0, 1.0, 2.5));
         assert!(read(Path::new("/nonexistent")).is_empty());
+        assert_eq!(length_m(&[DVec3::ZERO, DVec3::X * 0.1, DVec3::new(0.1, 0.1, 0.0), DVec3::splat(5.0)]), 0.2);
     }
 }

@@ -42,6 +42,15 @@ impl SurfaceSamples {
         samples
     }
 
+    /// Those for which `wanted` is true.
+    #[must_use]
+    pub fn only(&self, wanted: &[bool]) -> Self {
+        fn chosen(all: &[Vec3], wanted: &[bool]) -> Vec<Vec3> {
+            all.iter().zip(wanted).filter(|(_, wanted)| **wanted).map(|(sample, _)| *sample).collect()
+        }
+        Self { points: chosen(&self.points, wanted), normals: chosen(&self.normals, wanted) }
+    }
+
     /// Number of samples.
     #[must_use]
     pub fn len(&self) -> usize {
