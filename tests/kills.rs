@@ -1,12 +1,15 @@
-//! Kills each service once in flight with SIGKILL: the mission completes with every keyframe exactly once.
+//! Kills each service once in flight with SIGKILL: the mission completes with every keyframe exactly once. Kills launch:
+//! the vehicle comes home without it, and `vantage resume` completes the mission.
 
 #![allow(clippy::expect_used, clippy::panic, clippy::unwrap_used, reason = "a test or bench fails by panicking")]
 
 mod common;
 
 use std::path::Path;
+use std::process::Stdio;
+use std::time::{Duration, Instant};
 
-use common::{Flight, keyframes, kill, metrics};
+use common::{Flight, journal, keyframes, kill, metrics, runs, system_of, vantage};
 
 /// Flies `tiny`, kills `service` once `after` keyframes are on disk, and expects the mission to complete.
 fn survives(service: &str, after: usize) {
@@ -61,4 +64,80 @@ fn a_mission_survives_the_world() {
 #[test]
 fn a_mission_survives_the_keeper() {
     survives("keeper", 1);
+}
+
+#[test]
+fn a_mission_survives_launch() {
+    let base = tempfile::tempdir().expect("folder");
+    let folder = base.path().join("mission");
+    let mut flight = Flight::start(&folder, &["--preset", "tiny", "--seed", "21"]);
+    flight.wait_until("the keyframes", |flight| keyframes(&flight.folder).len() >= 2);
+    let (services, system) = (flight.services(), system_of(flight.pid()));
+    kill(flight.pid(), "KILL");
+    flight.finish();
+    let began = Instant::now();
+    while services.values().any(|pid| runs(*pid)) {
+        let left: Vec<_> = services.iter().filter(|(_, pid)| runs(**pid)).collect();
+        assert!(began.elapsed() < Duration::from_secs(60), "still there: {left:?}");
+        std::thread::sleep(Duration::from_millis(20));
+    }
+    println!("all services ended {:.1} s after launch", began.elapsed().as_secs_f64());
+    let log = std::fs::read_to_string(folder.join("logs/px4-link.log")).expect("log");
+    assert!(log.contains("in the air: returning and landing before leaving"), "{log}");
+    assert!(!log.contains("the mission clock is gone"), "px4-link left before the vehicle had landed: {log}");
+    let ended = journal(&folder).iter().any(|entry| entry["event"] == "ending" || entry["event"] == "over");
+    assert!(!ended, "nothing ends the mission but its user");
+    assert!(system.remove_if_dead().expect("removed"), "nobody holds it any more");
+    assert!(!system.runtime_dir.exists() && system.shared_memory_files().is_empty());
+
+    let mut resume = vantage();
+    resume.arg("resume").arg(&folder);
+    Flight::spawn(&folder, resume).finish_well();
+    assert_eq!(keyframes(&folder), (0..6).collect::<Vec<u64>>());
+    let metrics = metrics(&folder);
+    assert_eq!(metrics["mission"]["end_reason"], "complete", "{metrics:#}");
+    assert_eq!(metrics["mission"]["collisions"], 0, "{metrics:#}");
+}
+
+#[test]
+fn a_terminal_that_hangs_up_does_not_end_the_flight() {
+    let base = tempfile::tempdir().expect("folder");
+    let folder = base.path().join("mission");
+    let mut child = vantage()
+        .args(["fly", "--preset", "tiny", "--seed", "21", "--output"])
+        .arg(&folder)
+        .stdin(Stdio::null())
+        .stdout(Stdio::null())
+        .stderr(Stdio::piped())
+        .spawn()
+        .expect("vantage starts");
+    // From now on every line of progress fails.
+    drop(child.stderr.take());
+    let began = Instant::now();
+    let status = loop {
+        if let Some(status) = child.try_wait().expect("waited") {
+            break status;
+        }
+        if began.elapsed() > common::LONGEST {
+            child.kill().expect("killed");
+        }
+        std::thread::sleep(Duration::from_millis(50));
+    };
+    assert!(status.success(), "{status}");
+    assert_eq!(keyframes(&folder), (0..6).collect::<Vec<u64>>());
+}
+
+#[test]
+fn an_interrupt_before_the_takeoff_is_not_forgotten() {
+    let base = tempfile::tempdir().expect("folder");
+    let folder = base.path().join("mission");
+    let mut flight = Flight::start(&folder, &["--preset", "tiny", "--seed", "21"]);
+    flight.wait_until("the planner", |flight| flight.services().contains_key("planner"));
+    let (services, began) = (flight.services(), Instant::now());
+    kill(flight.pid(), "INT");
+    let status = flight.finish();
+    assert_eq!(status.code(), Some(1), "{status}");
+    assert!(began.elapsed() < Duration::from_secs(30), "{:?}", began.elapsed());
+    assert!(services.values().all(|pid| !runs(*pid)));
+    assert!(!journal(&folder).iter().any(|entry| entry["event"] == "airborne"), "it did not fly");
 }

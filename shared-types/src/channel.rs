@@ -4,6 +4,7 @@
 //! alone. Safe overflow everywhere: a full queue loses its oldest message, and no sender ever waits for a reader.
 
 use crate::Payload;
+use crate::bus::Envelope;
 use crate::messages::{
     Alive, CandidateScore, CandidateState, CandidateView, CaptureReply, CaptureRequest, ClockGrant, ClockTick,
     CommandReply, CommandRequest, ControlReply, ControlRequest, FrameHeader, GaussianRow, Health, MissionReply,
@@ -35,6 +36,8 @@ pub struct Settings {
     pub items: ItemLimit,
     /// Chunks reserved for each publisher; `None`: the worst case of all readers, for small messages.
     pub chunks: Option<usize>,
+    /// Processes that send on it in a mission: how much shared memory it takes in all.
+    pub senders: usize,
     /// Whether a message wakes its readers.
     pub wakes: bool,
     /// Whether readers in lockstep see only what was sent before the present tick.
@@ -42,8 +45,15 @@ pub struct Settings {
 }
 
 impl Settings {
-    const SMALL: Self =
-        Self { queue: 16, history: 0, items: ItemLimit::Fixed(1), chunks: None, wakes: false, by_tick: true };
+    const SMALL: Self = Self {
+        queue: 16,
+        history: 0,
+        items: ItemLimit::Fixed(1),
+        chunks: None,
+        senders: 1,
+        wakes: false,
+        by_tick: true,
+    };
     const STATE: Self = Self { queue: 4, history: 1, ..Self::SMALL };
 }
 
@@ -66,8 +76,11 @@ pub trait Channel: 'static {
     /// What the slice is made of.
     type Item: Payload;
 
-    /// Hash over both types, published as the service's attribute.
-    const SCHEMA: u64 = crate::payload::fold(<Self::Header as Payload>::SCHEMA, <Self::Item as Payload>::SCHEMA);
+    /// Hash over both types and the envelope around them, published as the service's attribute.
+    const SCHEMA: u64 = crate::payload::fold(
+        crate::payload::fold(<Envelope as Payload>::SCHEMA, <Self::Header as Payload>::SCHEMA),
+        <Self::Item as Payload>::SCHEMA,
+    );
 }
 
 /// A channel with an answer: a pair of channels, `<name>/request` and `<name>/reply`. Replies may stream, a server that
@@ -130,13 +143,13 @@ channels! {
     VehicleTargetChannel = "vehicle/target", VehicleTarget, Waypoint,
         Settings { items: ItemLimit::Fixed(256), queue: 8, ..Settings::SMALL };
     /// Half of [`VehicleCommandChannel`].
-    VehicleCommandRequests = "vehicle/command/request", CommandRequest, u8, Settings::SMALL;
+    VehicleCommandRequests = "vehicle/command/request", CommandRequest, u8, Settings { senders: 2, ..Settings::SMALL };
     /// Half of [`VehicleCommandChannel`].
     VehicleCommandReplies = "vehicle/command/reply", CommandReply, u8, Settings::SMALL;
     /// The planner's heartbeat.
     AliveChannel = "planner/alive", Alive, u8, Settings::SMALL;
     /// Half of [`MissionCommandChannel`].
-    MissionCommandRequests = "mission/command/request", MissionRequest, u8, Settings::SMALL;
+    MissionCommandRequests = "mission/command/request", MissionRequest, u8, Settings { senders: 2, ..Settings::SMALL };
     /// Half of [`MissionCommandChannel`].
     MissionCommandReplies = "mission/command/reply", MissionReply, u8, Settings::SMALL;
     /// What the mission does.
@@ -157,27 +170,28 @@ channels! {
         Settings { queue: 4, items: ItemLimit::Image, chunks: Some(12), ..Settings::SMALL };
     /// Half of [`RoundChannel`].
     RoundRequests = "trainer/round/request", RoundRequest, u64,
-        Settings { items: ItemLimit::Fixed(1024), queue: 4, ..Settings::SMALL };
+        Settings { items: ItemLimit::Fixed(1024), queue: 4, chunks: Some(16), ..Settings::SMALL };
     /// Half of [`RoundChannel`].
     RoundReplies = "trainer/round/reply", RoundReply, u8, Settings::SMALL;
     /// The model. Few chunks, since each is large; a live snapshot without a free chunk is skipped and counted.
     SnapshotChannel = "model/snapshot", SnapshotHeader, GaussianRow,
         Settings { queue: 1, history: 1, items: ItemLimit::Gaussians, chunks: Some(6), ..Settings::SMALL };
-    /// Half of [`ScoreChannel`].
+    /// Half of [`ScoreChannel`]. Few chunks, since each is large: the other end's queue and what it reads, twice over for a
+    /// recorder and a tool that look in.
     ScoreRequests = "scorer/score/request", ScoreRequest, CandidateView,
-        Settings { items: ItemLimit::Fixed(2048), queue: 4, ..Settings::SMALL };
+        Settings { items: ItemLimit::Fixed(2048), queue: 4, chunks: Some(16), ..Settings::SMALL };
     /// Half of [`ScoreChannel`].
     ScoreReplies = "scorer/score/reply", ScoreReply, CandidateScore,
-        Settings { items: ItemLimit::Fixed(2048), queue: 4, ..Settings::SMALL };
+        Settings { items: ItemLimit::Fixed(2048), queue: 4, chunks: Some(16), ..Settings::SMALL };
     /// Health of every service, once a second.
-    HealthChannel = "health", Health, u8, Settings { queue: 32, by_tick: false, ..Settings::SMALL };
+    HealthChannel = "health", Health, u8, Settings { queue: 32, senders: 8, by_tick: false, ..Settings::SMALL };
     /// The keeper's memory: the last health of every service, one item each, dead ones included.
     HealthLastChannel = "health/last", Health, Health,
         Settings { items: ItemLimit::Fixed(16), by_tick: false, ..Settings::STATE };
     /// Half of [`ControlChannel`].
     ControlRequests = "control/request", ControlRequest, u8, Settings { by_tick: false, ..Settings::SMALL };
     /// Half of [`ControlChannel`].
-    ControlReplies = "control/reply", ControlReply, u8, Settings { by_tick: false, ..Settings::SMALL };
+    ControlReplies = "control/reply", ControlReply, u8, Settings { senders: 8, by_tick: false, ..Settings::SMALL };
     /// The true pose, for the world and for evaluation.
     TruthChannel = "simulator/truth", Truth, u8, Settings { queue: 512, chunks: Some(4096), by_tick: false, ..Settings::SMALL };
     /// Half of [`RenderChannel`].
@@ -189,7 +203,7 @@ channels! {
     /// The mission clock.
     ClockChannel = "clock", ClockTick, u8, Settings { wakes: true, by_tick: false, ..Settings::STATE };
     /// Grants of its members.
-    GrantChannel = "clock/grant", ClockGrant, u8, Settings { queue: 64, wakes: true, by_tick: false, ..Settings::SMALL };
+    GrantChannel = "clock/grant", ClockGrant, u8, Settings { queue: 64, senders: 5, wakes: true, by_tick: false, ..Settings::SMALL };
 }
 
 requests! {

@@ -54,14 +54,20 @@ where
 }
 
 /// Declares a struct that may lie in shared memory: `repr(C)`, `Pod` (so a layout with padding does not compile), zero
-/// by default, with a schema hash over its declaration.
+/// by default, with a schema hash over its declaration. The size in bytes after the name is checked, so that nobody
+/// changes what crosses processes without noticing.
 #[macro_export]
 macro_rules! payload {
-    ($(#[$doc:meta])* pub struct $name:ident { $( $(#[$field_doc:meta])* pub $field:ident : $kind:ty ),* $(,)? }) => {
+    ($(#[$doc:meta])* pub struct $name:ident [$size:literal] { $( $(#[$field_doc:meta])* pub $field:ident : $kind:ty ),* $(,)? }) => {
         $(#[$doc])*
         #[repr(C)]
         #[derive(Debug, Clone, Copy, PartialEq, $crate::private::Pod, $crate::private::Zeroable)]
         pub struct $name { $( $(#[$field_doc])* pub $field: $kind ),* }
+
+        const _: () = assert!(
+            core::mem::size_of::<$name>() == $size,
+            concat!(stringify!($name), ": the size in bytes is not the declared one")
+        );
 
         impl Default for $name {
             fn default() -> Self { <Self as $crate::private::Zeroable>::zeroed() }
@@ -141,18 +147,18 @@ mod tests {
 
     payload! {
         /// Two numbers.
-        pub struct Ab { pub a: u32, pub b: u32 }
+        pub struct Ab [8] { pub a: u32, pub b: u32 }
     }
     mod swapped {
         payload! {
             /// The same two, the other way round.
-            pub struct Ab { pub b: u32, pub a: u32 }
+            pub struct Ab [8] { pub b: u32, pub a: u32 }
         }
     }
     mod retyped {
         payload! {
             /// The same names, another type of the same size.
-            pub struct Ab { pub a: u32, pub b: f32 }
+            pub struct Ab [8] { pub a: u32, pub b: f32 }
         }
     }
     codes! {

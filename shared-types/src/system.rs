@@ -4,9 +4,13 @@
 //! outlives its run. Its folder lies on tmpfs: opening a channel there is faster, and the instant in which a kill leaves
 //! half-made files is shorter.
 
-use std::fs;
+use std::fs::{self, File};
+use std::io::ErrorKind;
+use std::os::unix::fs::MetadataExt as _;
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
+use rustix::fs::{FlockOperation, flock};
 use serde::{Deserialize, Serialize};
 
 /// Where iceoryx2 keeps shared memory.
@@ -46,6 +50,24 @@ pub enum SystemError {
         /// Its length.
         length: usize,
     },
+    /// Processes of a system of that name run.
+    #[error("{}: a system of this name runs (`vantage status`); expected none: stop it first, or choose another --system", path.display())]
+    Runs {
+        /// Its folder.
+        path: PathBuf,
+    },
+    /// A name that is none.
+    #[error("--system {name:?}: expected a name without '/', at most {LONGEST_ROOT} bytes with its folder")]
+    BadName {
+        /// What was given.
+        name: String,
+    },
+    /// The folder vanished while it was opened.
+    #[error("{}: the system ended while it was joined; start it again", path.display())]
+    Ended {
+        /// The folder.
+        path: PathBuf,
+    },
     /// No system, or more than one, where one was expected.
     #[error("{found} systems in {}: {names}; expected one: name it with --system", base.display())]
     NotOne {
@@ -56,6 +78,21 @@ pub enum SystemError {
         /// Their names.
         names: String,
     },
+}
+
+impl SystemError {
+    /// Whether there is no system description at all, as before a system is made.
+    #[must_use]
+    pub fn is_absent(&self) -> bool {
+        matches!(self, Self::Io { action: "read", source, .. } if source.kind() == ErrorKind::NotFound)
+    }
+}
+
+/// Keeps a system from being taken for dead: every process with a part in it has one for its life. A killed process loses
+/// it with everything else, so no trace of the dead can be mistaken for life.
+#[derive(Debug)]
+pub struct Hold {
+    _lock: File,
 }
 
 /// A system and where its parts lie. Stored as `system.json` in its folder.
@@ -87,11 +124,22 @@ impl System {
         }
     }
 
-    /// Makes a fresh system below `base`.
+    /// Makes a fresh system below `base`. What a dead one of that name left is removed first.
     ///
     /// # Errors
-    /// When the folder cannot be made or its path is too long.
+    /// When the folder cannot be made or its path is too long, or when a system of that name runs.
     pub fn create(base: &Path, name: &str, supervisor_pid: u32) -> Result<Self, SystemError> {
+        Self::create_held(base, name, supervisor_pid).map(|(system, _)| system)
+    }
+
+    /// As [`Self::create`]; the system is held from its first instant, so that nobody takes it for dead meanwhile.
+    ///
+    /// # Errors
+    /// As [`Self::create`].
+    pub fn create_held(base: &Path, name: &str, supervisor_pid: u32) -> Result<(Self, Hold), SystemError> {
+        if name.is_empty() || name.contains('/') || name.starts_with('.') {
+            return Err(SystemError::BadName { name: name.to_owned() });
+        }
         let runtime_dir = base.join(name);
         let length = runtime_dir.as_os_str().len();
         if length > LONGEST_ROOT {
@@ -107,7 +155,8 @@ impl System {
             supervisor_pid,
             version: env!("CARGO_PKG_VERSION").to_owned(),
         };
-        io(&system.runtime_dir, "make", fs::create_dir_all(&system.runtime_dir))?;
+        io(base, "make", fs::create_dir_all(base))?;
+        let hold = system.claim_folder()?;
         let config = format!(
             "[global]\nroot-path = '{}'\nprefix = '{}'\n",
             system.runtime_dir.join("bus").display(),
@@ -122,7 +171,74 @@ impl System {
         let aside = system.runtime_dir.join("system.json.new");
         io(&aside, "write", fs::write(&aside, text))?;
         io(&description, "rename", fs::rename(&aside, &description))?;
-        Ok(system)
+        Ok((system, hold))
+    }
+
+    /// Makes the folder and holds it. Another process may make or remove the same one at the same time: then once more.
+    fn claim_folder(&self) -> Result<Hold, SystemError> {
+        for _ in 0..50 {
+            match fs::create_dir(&self.runtime_dir) {
+                Ok(()) => match self.hold() {
+                    Err(SystemError::Ended { .. } | SystemError::Runs { .. }) => {}
+                    held => return held,
+                },
+                Err(error) if error.kind() == ErrorKind::AlreadyExists => remove_dead(&self.runtime_dir)?,
+                Err(source) => {
+                    return Err(SystemError::Io { path: self.runtime_dir.clone(), action: "make", source });
+                }
+            }
+            std::thread::sleep(Duration::from_millis(10));
+        }
+        Err(SystemError::Runs { path: self.runtime_dir.clone() })
+    }
+
+    /// Holds the system for as long as the returned value lives.
+    ///
+    /// # Errors
+    /// When it is gone, or being removed.
+    pub fn hold(&self) -> Result<Hold, SystemError> {
+        let ended = || SystemError::Ended { path: self.runtime_dir.clone() };
+        let lock = match File::open(&self.runtime_dir) {
+            Err(error) if error.kind() == ErrorKind::NotFound => return Err(ended()),
+            opened => io(&self.runtime_dir, "open", opened)?,
+        };
+        let mut tries = 0;
+        while let Err(error) = flock(&lock, FlockOperation::NonBlockingLockShared) {
+            // Somebody looks whether the system is alive, which takes an instant, or removes it.
+            if error != rustix::io::Errno::WOULDBLOCK {
+                return io(&self.runtime_dir, "lock", Err(error.into()));
+            }
+            if tries == 50 {
+                return Err(ended());
+            }
+            tries += 1;
+            std::thread::sleep(Duration::from_millis(2));
+        }
+        // The folder may have been removed, and even made anew, between opening and locking.
+        let inode = io(&self.runtime_dir, "read", lock.metadata())?.ino();
+        match fs::metadata(&self.runtime_dir) {
+            Ok(now) if now.ino() == inode => Ok(Hold { _lock: lock }),
+            _ => Err(ended()),
+        }
+    }
+
+    /// Whether any process has a part in this system.
+    #[must_use]
+    pub fn is_alive(&self) -> bool {
+        File::open(&self.runtime_dir)
+            .is_ok_and(|folder| flock(&folder, FlockOperation::NonBlockingLockExclusive).is_err())
+    }
+
+    /// Removes everything that belongs to this system, unless a process has a part in it; true when it is removed.
+    ///
+    /// # Errors
+    /// When the folder cannot be removed.
+    pub fn remove_if_dead(&self) -> Result<bool, SystemError> {
+        match remove_dead(&self.runtime_dir) {
+            Ok(()) => Ok(true),
+            Err(SystemError::Runs { .. }) => Ok(false),
+            Err(error) => Err(error),
+        }
     }
 
     /// Opens a system by its folder.
@@ -205,32 +321,35 @@ impl System {
     }
 }
 
+/// Removes the system in a folder if no process holds it. The lock is kept until the folder is gone, so that nobody joins
+/// what is being removed.
+fn remove_dead(folder: &Path) -> Result<(), SystemError> {
+    let lock = match File::open(folder) {
+        Err(error) if error.kind() == ErrorKind::NotFound => return Ok(()),
+        opened => io(folder, "open", opened)?,
+    };
+    match flock(&lock, FlockOperation::NonBlockingLockExclusive) {
+        Ok(()) => {}
+        Err(rustix::io::Errno::WOULDBLOCK) => return Err(SystemError::Runs { path: folder.to_owned() }),
+        Err(error) => io(folder, "lock", Err(error.into()))?,
+    }
+    match System::open(folder) {
+        Ok(system) => System { runtime_dir: folder.to_owned(), ..system }.remove(),
+        // Its maker was killed before the description was there: nothing else can be inside yet.
+        Err(error) if error.is_absent() => {
+            for file in ["iceoryx2.toml", "system.json.new"] {
+                fs::remove_file(folder.join(file)).ok();
+            }
+            io(folder, "remove", fs::remove_dir(folder))
+        }
+        // Without its description, its files in shared memory cannot be told from others'.
+        Err(error) => Err(error),
+    }
+}
+
 fn io<T>(path: &Path, action: &'static str, result: std::io::Result<T>) -> Result<T, SystemError> {
     result.map_err(|source| SystemError::Io { path: path.to_owned(), action, source })
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_system_is_found_by_name_alone_and_leaves_nothing() {
-        let base = tempfile::tempdir_in("/dev/shm").expect("tmpfs");
-        let system = System::create(base.path(), "one", 0).expect("made");
-        assert_eq!(System::find(base.path(), None).expect("the only one"), system);
-        assert_eq!(System::find(base.path(), Some("one")).expect("named"), system);
-        let other = System::create(base.path(), "two", 0).expect("made");
-        assert_ne!(other.prefix, system.prefix);
-        let error = System::find(base.path(), None).expect_err("two");
-        assert!(error.to_string().contains("one, two"), "{error}");
-        system.remove().expect("removed");
-        other.remove().expect("removed");
-        assert_eq!(fs::read_dir(base.path()).expect("base").count(), 0);
-    }
-
-    #[test]
-    fn a_path_too_long_for_sockets_is_refused() {
-        let error = System::create(Path::new(&format!("/dev/shm/{}", "x".repeat(80))), "n", 0).expect_err("too long");
-        assert!(error.to_string().contains("XDG_RUNTIME_DIR"), "{error}");
-    }
-}
+mod tests;

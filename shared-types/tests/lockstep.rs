@@ -6,10 +6,10 @@ use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use shared_types::bus::{Bus, Limits, Publisher, Subscriber, wait};
-use shared_types::channel::{AliveChannel, ClockChannel, GrantChannel};
+use shared_types::channel::{AliveChannel, ClockChannel, ControlChannel, GrantChannel};
 use shared_types::config::Config;
-use shared_types::messages::{Alive, ClockGrant, ClockTick};
-use shared_types::service::{Context, HealthReport, Service, ServiceError, Step};
+use shared_types::messages::{Alive, ClockGrant, ClockTick, ControlCommand, ControlRequest};
+use shared_types::service::{Context, HealthReport, Service, ServiceError, Step, StopAnswer};
 use shared_types::system::System;
 use shared_types::{ServiceName, TICK_NS};
 
@@ -131,5 +131,95 @@ fn members_march_in_step_and_hear_each_other_one_tick_later() {
         assert_eq!(*heard.lock().expect("heard"), expected);
     }
     drop(clock);
+    system.remove().expect("removed");
+}
+
+/// Has something to finish that takes more mission time than there will be, unless it is asked to stop.
+struct Stubborn {
+    stops: Arc<Mutex<u32>>,
+}
+
+impl Service for Stubborn {
+    fn step(&mut self, _now_ns: u64) -> Result<Step, ServiceError> {
+        Ok(Step::Done)
+    }
+
+    fn health(&self) -> HealthReport {
+        HealthReport::running()
+    }
+
+    fn stop(&mut self, _now_ns: u64) -> StopAnswer {
+        *self.stops.lock().expect("stops") += 1;
+        StopAnswer::Now
+    }
+
+    fn orphaned(&mut self, _now_ns: u64) -> StopAnswer {
+        StopAnswer::Later
+    }
+}
+
+/// A stubborn member whose supervisor was gone before it began, after three ticks; then no clock any more.
+fn orphan(base: &std::path::Path) -> (System, Arc<Mutex<u32>>, std::thread::JoinHandle<()>, Clock) {
+    let system = System::create(base, "o", u32::MAX).expect("system");
+    let stops = Arc::new(Mutex::new(0));
+    let (of_thread, counted) = (system.clone(), Arc::clone(&stops));
+    let thread = std::thread::spawn(move || {
+        let mut context = Context::open(ServiceName::Planner, Config::default(), of_thread, true).expect("context");
+        context.run(&mut Stubborn { stops: counted }).expect("ran");
+    });
+    let mut clock = Clock::open(&system);
+    for k in 0..3 {
+        clock.tick(k, &[ServiceName::Planner]);
+    }
+    (system, stops, thread, clock)
+}
+
+fn ends_within(thread: &std::thread::JoinHandle<()>, limit: Duration) -> bool {
+    let deadline = Instant::now() + limit;
+    while !thread.is_finished() && Instant::now() < deadline {
+        std::thread::sleep(Duration::from_millis(20));
+    }
+    thread.is_finished()
+}
+
+#[test]
+fn an_orphan_that_wants_to_finish_something_leaves_when_the_clock_is_gone() {
+    let base = tempfile::tempdir_in("/dev/shm").expect("tmpfs");
+    let (system, stops, thread, _clock) = orphan(base.path());
+    assert!(!ends_within(&thread, Duration::from_millis(1000)), "what is not finished is not left at once");
+    assert!(ends_within(&thread, Duration::from_secs(10)), "without a clock it would never be finished");
+    thread.join().expect("joined");
+    assert_eq!(*stops.lock().expect("stops"), 0);
+    system.remove().expect("removed");
+}
+
+#[test]
+fn an_orphan_that_finishes_something_can_still_be_asked_to_stop() {
+    let base = tempfile::tempdir_in("/dev/shm").expect("tmpfs");
+    let (system, stops, thread, mut clock) = orphan(base.path());
+    let bus = Bus::open(&system, Limits::of(&Config::default()), ServiceName::Command, 2, false).expect("bus");
+    let mut client = bus.client::<ControlChannel>().expect("client");
+    // By now it has noticed that it is an orphan.
+    std::thread::sleep(Duration::from_millis(500));
+    let request = ControlRequest {
+        service: ServiceName::Planner.code(),
+        command: ControlCommand::Stop.code(),
+        ..ControlRequest::default()
+    };
+    client.send(0, 1, &request, &[]).expect("sent");
+    let deadline = Instant::now() + Duration::from_secs(10);
+    let mut k = 3;
+    while !thread.is_finished() {
+        assert!(Instant::now() < deadline, "it never stopped");
+        // Time goes on: it is the request that ends it.
+        clock.present.tick = k;
+        clock.ticks.send(k, k, &clock.present).expect("tick");
+        k += 1;
+        std::thread::sleep(Duration::from_millis(20));
+        client.receive(0).expect("reply");
+    }
+    thread.join().expect("joined");
+    assert_eq!(*stops.lock().expect("stops"), 1);
+    drop((clock, client, bus));
     system.remove().expect("removed");
 }

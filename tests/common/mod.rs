@@ -152,6 +152,18 @@ pub fn children_of(parent: u32) -> BTreeMap<String, u32> {
     found
 }
 
+/// Whether a process runs; one that nobody has reaped does not.
+pub fn runs(pid: u32) -> bool {
+    fs::read_to_string(format!("/proc/{pid}/stat"))
+        .is_ok_and(|stat| stat.rsplit_once(") ").is_some_and(|(_, rest)| !rest.starts_with('Z')))
+}
+
+/// The system that a launch supervises.
+pub fn system_of(launch: u32) -> shared_types::system::System {
+    let systems = shared_types::system::System::list(&shared_types::system::System::base_dir());
+    systems.into_iter().find(|system| system.supervisor_pid == launch).expect("launch has made its system")
+}
+
 /// Ids of the complete keyframes in a mission folder.
 pub fn keyframes(folder: &Path) -> Vec<u64> {
     let mut ids: Vec<u64> = fs::read_dir(folder.join("keyframes"))

@@ -28,12 +28,20 @@ use roster::Roster;
 const JANITOR_PERIOD: Duration = Duration::from_millis(200);
 const REAPER_PERIOD: Duration = Duration::from_millis(50);
 
+/// Begins to remove what was left half-made. Before anything else: joining the bus itself waits for ever on such a file,
+/// and there is nobody but the keeper to remove it.
+///
+/// # Errors
+/// When there is no thread to be had.
+pub fn sweep(system: &System) -> anyhow::Result<Sweeping> {
+    Sweeping::start(system)
+}
+
 /// Runs the keeper until it is asked to stop.
 ///
 /// # Errors
 /// When the bus cannot be joined, or a channel belongs to another version.
-pub fn run(mut context: Context) -> anyhow::Result<()> {
-    let janitor = Sweeping::start(&context.system)?;
+pub fn run(mut context: Context, janitor: Sweeping) -> anyhow::Result<()> {
     let reaper = Reaping::start(&context)?;
     let mut keeper =
         Keeper { ports: Ports::open(&context.bus)?, roster: Roster::default(), janitor, reaper, orphaned: false };
@@ -84,7 +92,8 @@ impl Service for Keeper {
 }
 
 /// The janitor's thread; ends when dropped.
-struct Sweeping {
+#[derive(Debug)]
+pub struct Sweeping {
     removed: Arc<AtomicU64>,
     stop: Arc<AtomicBool>,
 }
@@ -142,5 +151,28 @@ impl Reaping {
 impl Drop for Reaping {
     fn drop(&mut self) {
         self.stop.store(true, Ordering::Relaxed);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::os::unix::fs::OpenOptionsExt as _;
+
+    #[test]
+    fn sweeping_needs_no_bus() {
+        let base = tempfile::tempdir_in("/dev/shm").expect("tmpfs");
+        let system = System::create(base.path(), "k", 0).expect("system");
+        // What a process leaves that was killed between making and sizing its shared memory.
+        let file = std::path::Path::new("/dev/shm").join(format!("{}x.dynamic", system.prefix));
+        std::fs::OpenOptions::new().create_new(true).write(true).mode(0o200).open(&file).expect("made");
+        let sweeping = sweep(&system).expect("a thread");
+        let began = Instant::now();
+        while file.exists() {
+            assert!(began.elapsed() < Duration::from_secs(20), "never removed");
+            std::thread::sleep(Duration::from_millis(20));
+        }
+        drop(sweeping);
+        system.remove().expect("removed");
     }
 }

@@ -10,7 +10,7 @@ use shared_types::system::{SHARED_MEMORY_DIR, System};
 use crate::cli::Doctor;
 use crate::exit::Exit;
 use crate::machine_check::{shared_memory_need_bytes, space_bytes};
-use crate::{instance, print, proc, settings};
+use crate::{instance, print, settings};
 
 /// How a check came out.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
@@ -114,16 +114,10 @@ fn runtime_folder(base: &Path) -> Finding {
     }
 }
 
-/// Whether any process still has a part in a system: its supervisor, or one whose command line names its folder.
-fn is_dead(system: &System) -> bool {
-    let supervised = system.supervisor_pid != 0 && proc::is_alive(system.supervisor_pid);
-    !supervised && !proc::any_command_line_names(&system.runtime_dir)
-}
-
 fn leftovers(base: &Path, clean: bool) -> Vec<Finding> {
     let mut findings = Vec::new();
     for system in System::list(base) {
-        if !is_dead(&system) {
+        if system.is_alive() {
             findings.push(Finding::new(
                 "system",
                 Verdict::Ok,
@@ -136,8 +130,9 @@ fn leftovers(base: &Path, clean: bool) -> Vec<Finding> {
             system.shared_memory_files().iter().filter_map(|file| Some(std::fs::metadata(file).ok()?.len())).sum();
         let found = format!("{} is dead and holds {} MiB of shared memory", system.name, bytes >> 20);
         findings.push(if clean {
-            match system.remove() {
-                Ok(()) => Finding::new("leftovers", Verdict::Ok, format!("{found}: removed"), ""),
+            match system.remove_if_dead() {
+                Ok(true) => Finding::new("leftovers", Verdict::Ok, format!("{found}: removed"), ""),
+                Ok(false) => Finding::new("system", Verdict::Ok, format!("{} was joined just now", system.name), ""),
                 Err(error) => {
                     Finding::new("leftovers", Verdict::Advice, format!("{found}: {error}"), "remove it as its owner")
                 }
@@ -210,13 +205,16 @@ mod tests {
     fn a_dead_system_is_found_and_removed_only_when_asked() {
         let base = tempfile::tempdir_in("/dev/shm").expect("tmpfs");
         let system = System::create(base.path(), "gone", u32::MAX).expect("made");
-        let alive = System::create(base.path(), "here", std::process::id()).expect("made");
+        // Without a supervisor, as under systemd: who holds it counts.
+        let (alive, hold) = System::create_held(base.path(), "here", 0).expect("made");
         let found = leftovers(base.path(), false);
         assert_eq!(found.iter().filter(|f| f.verdict == Verdict::Advice).count(), 1);
         assert!(system.runtime_dir.exists());
         leftovers(base.path(), true);
         assert!(!system.runtime_dir.exists() && alive.runtime_dir.exists());
-        alive.remove().expect("removed");
+        drop(hold);
+        leftovers(base.path(), true);
+        assert!(!alive.runtime_dir.exists());
     }
 
     #[test]

@@ -3,6 +3,7 @@
 use std::process::ExitCode;
 
 use shared_types::folder::FolderError;
+use shared_types::service::ServiceError;
 
 /// How a command ends, as its exit code.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -71,6 +72,12 @@ pub fn exit_of(error: &anyhow::Error) -> Exit {
                 FolderError::Damaged { .. } => Exit::Failed,
             };
         }
+        // Its own errors are shown as if they were the service's: they are not in the chain.
+        match cause.downcast_ref::<ServiceError>() {
+            Some(ServiceError::Bus(_)) => return Exit::Missing,
+            Some(ServiceError::Unusable(_)) => return Exit::Usage,
+            Some(ServiceError::Other(_)) | None => {}
+        }
         if cause.is::<shared_types::system::SystemError>() || cause.is::<shared_types::bus::BusError>() {
             return Exit::Missing;
         }
@@ -95,5 +102,10 @@ mod tests {
         let error = anyhow::Error::from(shared_types::config::preset("huge").expect_err("unknown")).context("loading");
         assert_eq!(exit_of(&error), Exit::Usage);
         assert_eq!(exit_of(&anyhow::anyhow!("a bug")), Exit::Internal);
+        let service = |error: ServiceError| exit_of(&anyhow::Error::from(error).context("world cannot go on"));
+        let bus = shared_types::bus::BusError::NoChunk { channel: "clock" };
+        assert_eq!(service(ServiceError::Bus(bus)), Exit::Missing);
+        assert_eq!(service(ServiceError::Unusable("rock.obj: no triangles".to_owned())), Exit::Usage);
+        assert_eq!(service(ServiceError::Other("a bug".to_owned())), Exit::Internal);
     }
 }

@@ -7,7 +7,7 @@ use anyhow::Context as _;
 use rustix::fs::{FlockOperation, flock};
 use shared_types::config::{Config, Layer, LinkConfig, load};
 use shared_types::folder::{MissionFolder, write_atomic};
-use shared_types::system::System;
+use shared_types::system::{Hold, System};
 use world::SceneConfig;
 use world::mesh::{Mesh, Placement};
 
@@ -32,9 +32,8 @@ pub fn fly(arguments: &Fly) -> anyhow::Result<Exit> {
     let text = load::to_toml(&config)?;
     let claim = claim_instance(&mut config)?;
     check_shared_memory(&config)?;
-    let folder = MissionFolder::create(&config.mission.folder)?;
-    check_disk(folder.root(), &config)?;
-    write_atomic(&folder.config_path(), text.as_bytes())?;
+    check_disk(Path::new(&config.mission.folder), &config)?;
+    let folder = MissionFolder::create_with(&config.mission.folder, &text)?;
     let name = arguments.system.clone().unwrap_or_else(|| format!("fly-{}", std::process::id()));
     mission(&folder, &config, &name, arguments.json, claim)
 }
@@ -57,6 +56,7 @@ pub fn resume(arguments: &Resume) -> anyhow::Result<Exit> {
     if let Some(problem) = config.problems().first() {
         return Err(Refusal::usage(format!("{} = {}: expected {}", problem.key, problem.value, problem.expected)));
     }
+    check_object(&config)?;
     config.mission.version = env!("CARGO_PKG_VERSION").to_owned();
     let claim = claim_instance(&mut config)?;
     check_shared_memory(&config)?;
@@ -183,13 +183,22 @@ fn claim_instance(config: &mut Config) -> anyhow::Result<Option<Claim>> {
     Ok(Some(claim))
 }
 
-/// A system that is removed when the run is over, however it ends.
-struct Owned(System);
+/// A system that is removed when the run is over, however it ends; unless services of it still bring a vehicle home.
+struct Owned {
+    system: System,
+    hold: Option<Hold>,
+}
 
 impl Drop for Owned {
     fn drop(&mut self) {
-        if let Err(error) = self.0.remove() {
-            tracing::warn!(%error, "the system's folder could not be removed");
+        self.hold = None;
+        match self.system.remove_if_dead() {
+            Ok(true) => {}
+            Ok(false) => crate::say(&format!(
+                "system {} is left to its services, which land the vehicle and end; `vantage doctor --clean` removes it then",
+                self.system.name
+            )),
+            Err(error) => tracing::warn!(%error, "the system's folder could not be removed"),
         }
     }
 }
@@ -210,16 +219,18 @@ fn mission(
     }
     let mut progress = Progress::new();
     let flight = {
-        let system = Owned(System::create(&System::base_dir(), system, std::process::id())?);
-        write_atomic(&system.0.config_path(), load::to_toml(config)?.as_bytes())?;
+        let (system, hold) = System::create_held(&System::base_dir(), system, std::process::id())?;
+        let owned = Owned { system, hold: Some(hold) };
+        let system = &owned.system;
+        write_atomic(&system.config_path(), load::to_toml(config)?.as_bytes())?;
         let starter = Starter {
             program: std::env::current_exe().context("cannot find the vantage binary")?,
-            system_folder: system.0.runtime_dir.clone(),
+            system_folder: system.runtime_dir.clone(),
             logs: folder.root().join("logs"),
             log_level: config.launch.log_level.clone(),
         };
         progress.say(&format!("mission {} in {}", config.mission.id, folder.root().display()));
-        let mut flight = supervise::run(&system.0, config, starter, &mut progress)?;
+        let mut flight = supervise::run(system, config, starter, &mut progress)?;
         if config.mission.epoch_ns > 0 {
             // What the wall's clock cut off does not repeat.
             flight.deterministic = Some(false);
@@ -248,7 +259,7 @@ fn finish(
             let text = if json { evaluate::to_json(&metrics)? } else { summary::table(&metrics, folder.root()) };
             print(&text)?;
         }
-        Err(error) => eprintln!("vantage: not measured: {error:#}"),
+        Err(error) => crate::say(&format!("vantage: not measured: {error:#}")),
     }
     verdict(folder, flight)
 }

@@ -52,7 +52,7 @@ pub fn main() -> ExitCode {
     match run(&cli.command) {
         Ok(exit) => exit.into(),
         Err(error) => {
-            eprintln!("vantage: {error:#}");
+            say(&format!("vantage: {error:#}"));
             exit_of(&error).into()
         }
     }
@@ -99,6 +99,12 @@ fn export_mission(arguments: &cli::Export) -> anyhow::Result<Exit> {
         0 => print(&format!("{}\n", out.display())),
         views => print(&format!("{}: {views} views, {} points\n", out.display(), summary.points)),
     }
+}
+
+/// Writes a line to standard error. Never fails: a terminal that has hung up is no reason to end a flight.
+pub(crate) fn say(text: &str) {
+    use std::io::Write as _;
+    writeln!(std::io::stderr(), "{text}").ok();
 }
 
 /// Writes to standard output; a reader that has seen enough (`| head`) is no error.

@@ -4,6 +4,7 @@ use std::path::Path;
 
 use rustix::fs::statvfs;
 use shared_types::bus::Limits;
+use shared_types::channel::{Channel, ChannelVisitor, visit_all};
 use shared_types::config::Config;
 use shared_types::system::SHARED_MEMORY_DIR;
 
@@ -12,20 +13,26 @@ use crate::exit::Refusal;
 /// Bytes of one Gaussian on the snapshot channel.
 const GAUSSIAN_BYTES: u64 = size_of::<shared_types::messages::GaussianRow>() as u64;
 
-/// Shared memory that a mission reserves, bytes: chunks of the large channels (the channel table's numbers) and 16 MiB for
-/// all others.
+/// What connections, service descriptions and the odd tool that looks in take besides, bytes.
+const BESIDES_BYTES: u64 = 16 << 20;
+
+struct Reserved {
+    limits: Limits,
+    bytes: u64,
+}
+
+impl ChannelVisitor for Reserved {
+    fn visit<C: Channel>(&mut self) {
+        self.bytes += self.limits.reserved_bytes::<C>();
+    }
+}
+
+/// Shared memory that a mission reserves, bytes: every channel of the table, and what lies around them.
 #[must_use]
 pub fn shared_memory_need_bytes(config: &Config) -> u64 {
-    use shared_types::channel::{Channel, DepthChannel, FrameChannel, KeyframeChannel, RenderReplies, SnapshotChannel};
-    let limits = Limits::of(config);
-    let chunks = |chunks: Option<usize>| chunks.unwrap_or(1) as u64;
-    let images = chunks(FrameChannel::SETTINGS.chunks)
-        + chunks(KeyframeChannel::SETTINGS.chunks)
-        + chunks(RenderReplies::SETTINGS.chunks);
-    images * limits.image_bytes as u64
-        + chunks(DepthChannel::SETTINGS.chunks) * limits.small_depth_bytes as u64
-        + chunks(SnapshotChannel::SETTINGS.chunks) * limits.gaussians as u64 * GAUSSIAN_BYTES
-        + (16 << 20)
+    let mut reserved = Reserved { limits: Limits::of(config), bytes: BESIDES_BYTES };
+    visit_all(&mut reserved);
+    reserved.bytes
 }
 
 /// Disk space that a mission may take, bytes: keyframes as PNG, three checkpoints with the optimiser's moments, models.
@@ -77,7 +84,9 @@ pub fn check_shared_memory(config: &Config) -> anyhow::Result<()> {
 /// Exit 69, with what is missing and the way out.
 pub fn check_disk(folder: &Path, config: &Config) -> anyhow::Result<()> {
     let need = disk_need_bytes(config);
-    let (_, free) = space_bytes(folder)?;
+    // Nothing is made before it is known to fit: the disk is that of the nearest folder that is there.
+    let there = folder.ancestors().find(|ancestor| ancestor.exists()).unwrap_or(Path::new("/"));
+    let (_, free) = space_bytes(there)?;
     if free >= need {
         return Ok(());
     }
@@ -98,6 +107,11 @@ mod tests {
     fn the_need_grows_with_the_model_and_the_image() {
         let small = shared_types::config::preset("tiny").expect("preset");
         let large = Config::default();
+        println!(
+            "tiny {} MiB, default {} MiB",
+            mib(shared_memory_need_bytes(&small)),
+            mib(shared_memory_need_bytes(&large))
+        );
         assert!(shared_memory_need_bytes(&small) < shared_memory_need_bytes(&large) / 2);
         assert!(disk_need_bytes(&small) < disk_need_bytes(&large) / 2);
     }
@@ -110,7 +124,9 @@ mod tests {
         assert!(message.contains("/dev/shm") && message.contains("model.max_gaussians"), "{message}");
         config.camera.width_px = 1_000_000;
         config.camera.height_px = 1_000_000;
-        let message = check_disk(Path::new("/tmp"), &config).expect_err("too small").to_string();
-        assert!(message.contains("--output"), "{message}");
+        let folder = Path::new("/tmp/not/yet/there");
+        let message = check_disk(folder, &config).expect_err("too small").to_string();
+        assert!(message.contains("--output") && message.contains("/tmp/not/yet/there"), "{message}");
+        assert!(!folder.exists());
     }
 }

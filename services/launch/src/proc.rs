@@ -53,17 +53,6 @@ pub fn nice(pid: u32) -> Option<i32> {
     stat.rsplit_once(") ")?.1.split_whitespace().nth(19 - 3)?.parse().ok()
 }
 
-/// Whether any process's arguments name a path: how a service tells which system it belongs to.
-#[must_use]
-pub fn any_command_line_names(path: &std::path::Path) -> bool {
-    let wanted = path.as_os_str().as_encoded_bytes();
-    let processes = fs::read_dir("/proc").into_iter().flatten().flatten();
-    processes
-        .filter(|entry| entry.file_name().to_string_lossy().bytes().all(|b| b.is_ascii_digit()))
-        .filter_map(|entry| fs::read(entry.path().join("cmdline")).ok())
-        .any(|line| line.split(|byte| *byte == 0).any(|argument| argument == wanted))
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -92,7 +92,7 @@ impl Progress {
         let new_phase = self.last_phase != Some(report.phase);
         match &self.bar {
             Some(bar) => bar.set_message(line.clone()),
-            None if new_phase => eprintln!("{line}"),
+            None if new_phase => crate::say(&line),
             None => {}
         }
         self.last_phase = Some(report.phase);
@@ -102,8 +102,8 @@ impl Progress {
     /// Says something that stays on the screen.
     pub fn say(&self, text: &str) {
         match &self.bar {
-            Some(bar) => bar.suspend(|| eprintln!("{text}")),
-            None => eprintln!("{text}"),
+            Some(bar) => bar.suspend(|| crate::say(text)),
+            None => crate::say(text),
         }
     }
 
@@ -111,7 +111,7 @@ impl Progress {
     pub fn doing(&self, text: &str) {
         match &self.bar {
             Some(bar) => bar.set_message(text.to_owned()),
-            None => eprintln!("{text}"),
+            None => crate::say(text),
         }
     }
 

@@ -1,5 +1,7 @@
 //! `vantage <service>`: one process in the foreground.
 
+use std::ffi::CString;
+use std::path::Path;
 use std::time::{Duration, Instant};
 
 use anyhow::Context as _;
@@ -9,7 +11,7 @@ use shared_types::config::{Config, Layer, load};
 use shared_types::folder::write_atomic;
 use shared_types::messages::ServiceState;
 use shared_types::service::Context;
-use shared_types::system::System;
+use shared_types::system::{Hold, System, SystemError};
 
 use crate::cli::Service;
 use crate::exit::Refusal;
@@ -22,8 +24,14 @@ use crate::supervise::plan::apply_scheduling;
 /// # Errors
 /// Bad configuration, no system, no shared memory, and whatever the service cannot go on with.
 pub fn run(name: ServiceName, arguments: &Service) -> anyhow::Result<()> {
+    // What `top` and `perf` show; threads that are started later have names of their own.
+    if let Ok(text) = CString::new(name.name())
+        && let Err(error) = rustix::thread::set_name(&text)
+    {
+        tracing::debug!(%error, "the process keeps its name");
+    }
     apply_scheduling(name);
-    let (system, config) = join(arguments)?;
+    let (system, config, _made) = join(arguments)?;
     if system.version != env!("CARGO_PKG_VERSION") {
         return Err(Refusal::missing(format!(
             "system {} was made by Vantage {}, expected {}; stop it and start all services with one version",
@@ -32,41 +40,70 @@ pub fn run(name: ServiceName, arguments: &Service) -> anyhow::Result<()> {
             env!("CARGO_PKG_VERSION")
         )));
     }
+    // Before the bus: joining it may wait for what only the keeper removes.
+    let sweeping = if name == ServiceName::Keeper { Some(keeper::sweep(&system)?) } else { None };
     let context = Context::open(name, config, system, arguments.supervised)?;
     tracing::info!(service = %name, system = %context.system.name, pid = std::process::id(), "started");
-    let result = dispatch(name, context).with_context(|| format!("{name} cannot go on"));
+    let result = dispatch(name, context, sweeping).with_context(|| format!("{name} cannot go on"));
     tracing::info!(service = %name, ok = result.is_ok(), "ended");
     result
 }
 
-/// The system and its resolved configuration.
-fn join(arguments: &Service) -> anyhow::Result<(System, Config)> {
-    let base = System::base_dir();
-    if let Ok(system) = System::find(&base, arguments.system.as_deref()) {
-        let config = load(&[Layer::of_file(&system.config_path())?])?;
-        return Ok((system, config));
-    }
-    let Some(name) = arguments.system.as_deref().filter(|name| !name.contains('/')) else {
-        // Nothing to make: the error of the search says what was expected.
-        return Err(System::find(&base, arguments.system.as_deref()).err().map_or_else(
-            || Refusal::missing("the system vanished while it was opened; try again"),
-            anyhow::Error::from,
-        ));
-    };
-    let config = settings::resolve(&arguments.settings)?;
-    let system = System::create(&base, name, 0)?;
-    let text = shared_types::config::load::to_toml(&config)?;
-    write_atomic(&system.config_path(), text.as_bytes())?;
-    Ok((system, config))
+/// How long a system may be in the making by another service that was started at the same time.
+const MAKING: Duration = Duration::from_secs(2);
+
+/// The system and its resolved configuration. Made where there is none of that name; of several services started at once,
+/// one makes it and the others join.
+///
+/// Who made it holds it from then on: otherwise another, that saw nothing an instant before, would take it for dead.
+fn join(arguments: &Service) -> anyhow::Result<(System, Config, Option<Hold>)> {
+    join_below(&System::base_dir(), arguments)
 }
 
-fn dispatch(name: ServiceName, mut context: Context) -> anyhow::Result<()> {
+fn join_below(base: &Path, arguments: &Service) -> anyhow::Result<(System, Config, Option<Hold>)> {
+    let began = Instant::now();
+    loop {
+        let waited = began.elapsed() > MAKING;
+        let to_make = arguments.system.as_deref().filter(|name| !name.contains('/'));
+        match (System::find(base, arguments.system.as_deref()), to_make) {
+            (Ok(system), _) if system.config_path().exists() || waited => {
+                let config = load(&[Layer::of_file(&system.config_path())?])?;
+                return Ok((system, config, None));
+            }
+            (Ok(_), _) => {}
+            (Err(error), Some(name)) if error.is_absent() => {
+                // A folder without a description is being made, or was left by a maker that was killed.
+                if !base.join(name).exists() || waited {
+                    let config = settings::resolve(&arguments.settings)?;
+                    match System::create_held(base, name, 0) {
+                        Ok((system, hold)) => {
+                            let text = shared_types::config::load::to_toml(&config)?;
+                            write_atomic(&system.config_path(), text.as_bytes())?;
+                            return Ok((system, config, Some(hold)));
+                        }
+                        // Another was quicker.
+                        Err(SystemError::Runs { .. }) if !waited => {}
+                        Err(error) => return Err(error.into()),
+                    }
+                }
+            }
+            (Err(error), _) => return Err(error.into()),
+        }
+        std::thread::sleep(Duration::from_millis(10));
+    }
+}
+
+fn dispatch(name: ServiceName, mut context: Context, sweeping: Option<keeper::Sweeping>) -> anyhow::Result<()> {
     match name {
-        ServiceName::Keeper => keeper::run(context),
+        ServiceName::Keeper => match sweeping {
+            Some(sweeping) => keeper::run(context, sweeping),
+            None => Err(anyhow::anyhow!("the keeper does not sweep")),
+        },
         ServiceName::Simulator => {
             // Alone (for other ground stations, or to try something), it runs free; in a mission it waits for its members.
             let members: &[ServiceName] = if context.supervised { &ServiceName::MEMBERS } else { &[] };
             simulator::run(&mut context, members).map_err(|error| match error.exit_code() {
+                64 => Refusal::usage(error.to_string()),
                 69 => Refusal::missing(error.to_string()),
                 _ => error.into(),
             })
@@ -94,7 +131,8 @@ const WORLD_PATIENCE: Duration = Duration::from_secs(30);
 fn await_world(context: &Context) -> anyhow::Result<()> {
     let mut health = context.bus.subscriber::<HealthChannel>()?;
     let began = Instant::now();
-    while began.elapsed() < WORLD_PATIENCE {
+    // Without a supervisor nobody waits for this camera: its loop sees to the rest.
+    while began.elapsed() < WORLD_PATIENCE && !context.orphaned() {
         while let Some(message) = health.receive(0)? {
             let heard = message.header();
             if heard.service == ServiceName::World.code() && heard.state == ServiceState::Running.code() {
@@ -105,4 +143,36 @@ fn await_world(context: &Context) -> anyhow::Result<()> {
     }
     tracing::warn!("the world is not ready; going on without");
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn arguments(system: &str) -> Service {
+        let settings = crate::cli::Settings { preset: "tiny".to_owned(), ..crate::cli::Settings::default() };
+        Service { settings, system: Some(system.to_owned()), supervised: false }
+    }
+
+    #[test]
+    fn services_that_start_at_once_join_one_system() {
+        let base = tempfile::tempdir_in("/dev/shm").expect("tmpfs");
+        let joined: Vec<_> = std::thread::scope(|scope| {
+            let start = || join_below(base.path(), &arguments("lab")).expect("joined");
+            let threads: Vec<_> = (0..8).map(|_| scope.spawn(start)).collect();
+            threads.into_iter().map(|thread| thread.join().expect("no panic")).collect()
+        });
+        assert!(joined.iter().all(|(system, ..)| *system == joined[0].0), "{joined:?}");
+        assert_eq!(joined.iter().filter(|(.., made)| made.is_some()).count(), 1);
+    }
+
+    #[test]
+    fn a_system_whose_description_cannot_be_read_is_not_made_anew() {
+        let base = tempfile::tempdir_in("/dev/shm").expect("tmpfs");
+        std::fs::create_dir(base.path().join("lab")).expect("made");
+        std::fs::write(base.path().join("lab/system.json"), "{").expect("written");
+        let error = join_below(base.path(), &arguments("lab")).expect_err("malformed");
+        assert!(error.to_string().contains("system.json"), "{error}");
+        assert_eq!(std::fs::read(base.path().join("lab/system.json")).expect("kept"), b"{");
+    }
 }

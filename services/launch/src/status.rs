@@ -1,6 +1,7 @@
 //! `vantage status`: what runs, since when, memory, and how old the last messages are.
 
 use std::fmt::Write as _;
+use std::sync::mpsc::sync_channel;
 use std::time::{Duration, Instant};
 
 use serde::Serialize;
@@ -20,6 +21,8 @@ use crate::{print, proc};
 
 /// Services send health once a second; a little more than that is listened for.
 const LISTEN: Duration = Duration::from_millis(1_300);
+/// Time to join a system's bus.
+const PATIENCE: Duration = Duration::from_secs(5);
 
 /// What is known of a service.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -41,6 +44,8 @@ pub struct ServiceRow {
     pub nice: Option<i32>,
     /// Proportional memory, megabytes.
     pub pss_mb: Option<f64>,
+    /// How often it was started again.
+    pub restarts: u32,
     /// 99th percentile of a turn, milliseconds.
     pub turn_p99_ms: f64,
     /// Messages received, sent and lost.
@@ -56,6 +61,8 @@ pub struct SystemReport {
     pub system: String,
     /// Folder.
     pub folder: String,
+    /// `runs`, `dead`, or `does not answer`.
+    pub condition: &'static str,
     /// Supervisor's process id; 0: none.
     pub supervisor_pid: u32,
     /// Whether the supervisor runs.
@@ -77,8 +84,9 @@ pub fn run(arguments: &Status) -> anyhow::Result<Exit> {
         None => System::list(&base),
     };
     let mut reports = Vec::new();
-    for system in &systems {
-        reports.push(look_at(system)?);
+    for system in systems {
+        // Nothing runs in a dead system: joining it would only wait for what its dead left half-made.
+        reports.push(if system.is_alive() { look_at_in_time(system)? } else { blank(&system, "dead") });
     }
     let text = if arguments.json {
         serde_json::to_string_pretty(&reports)? + "\n"
@@ -90,16 +98,33 @@ pub fn run(arguments: &Status) -> anyhow::Result<Exit> {
     print(&text)
 }
 
-fn look_at(system: &System) -> anyhow::Result<SystemReport> {
-    let supervised = system.supervisor_pid != 0 && proc::is_alive(system.supervisor_pid);
-    let mut report = SystemReport {
+/// Joining a bus waits for what a killed process left half-made until the keeper has removed it; without a keeper, for
+/// ever. The system is looked at from a thread of its own, which is left behind where that happens.
+fn look_at_in_time(system: System) -> anyhow::Result<SystemReport> {
+    let (sender, receiver) = sync_channel(1);
+    let unreachable = blank(&system, "does not answer");
+    std::thread::Builder::new().name("status".to_owned()).spawn(move || {
+        // Nobody listens any more when it took too long.
+        sender.send(look_at(&system)).ok();
+    })?;
+    receiver.recv_timeout(LISTEN + PATIENCE).unwrap_or(Ok(unreachable))
+}
+
+/// What is known of a system without joining it.
+fn blank(system: &System, condition: &'static str) -> SystemReport {
+    SystemReport {
         system: system.name.clone(),
         folder: system.runtime_dir.display().to_string(),
+        condition,
         supervisor_pid: system.supervisor_pid,
-        supervised,
+        supervised: system.supervisor_pid != 0 && proc::is_alive(system.supervisor_pid),
         mission: None,
         services: Vec::new(),
-    };
+    }
+}
+
+fn look_at(system: &System) -> anyhow::Result<SystemReport> {
+    let mut report = blank(system, "runs");
     let Ok(layer) = Layer::of_file(&system.config_path()) else { return Ok(report) };
     let config = load(&[layer])?;
     let bus = Bus::open(system, Limits::of(&config), ServiceName::Command, monotonic_ns(), false)?;
@@ -136,7 +161,9 @@ fn look_at(system: &System) -> anyhow::Result<SystemReport> {
 fn note(known: &mut Vec<(Health, Option<Instant>)>, health: &Health, heard: Option<Instant>) {
     match known.iter_mut().find(|(other, _)| other.service == health.service) {
         Some((other, when)) if health.incarnation >= other.incarnation => {
-            *other = *health;
+            // Only the keeper counts restarts.
+            let restarts = other.restarts.max(health.restarts);
+            *other = Health { restarts, ..*health };
             *when = heard.or(*when);
         }
         Some(_) => {}
@@ -161,6 +188,7 @@ fn row(health: &Health, heard: Option<Instant>) -> Option<ServiceRow> {
         heard_s: heard.map(|when| when.elapsed().as_secs_f64()),
         nice: proc::nice(health.pid),
         pss_mb,
+        restarts: health.restarts,
         turn_p99_ms,
         messages: [health.received, health.sent, health.dropped],
         last_error: unpack_text(&health.last_error),
@@ -176,6 +204,17 @@ fn describe(report: &SystemReport) -> String {
             writeln!(text, ", supervisor {pid} is gone: `vantage doctor --clean` removes what is left").unwrap_or(())
         }
     }
+    match report.condition {
+        "dead" => {
+            text.push_str("dead: `vantage doctor --clean` removes it\n");
+            return text;
+        }
+        "does not answer" => {
+            text.push_str("does not answer: is its keeper running? (`vantage keeper --system NAME`)\n");
+            return text;
+        }
+        _ => {}
+    }
     if let Some(mission) = &report.mission {
         writeln!(text, "mission {mission}").ok();
     }
@@ -184,8 +223,8 @@ fn describe(report: &SystemReport) -> String {
         return text;
     }
     let header = format!(
-        "{:<10} {:>7} {:<9} {:>8} {:>7} {:>4} {:>8} {:>9} {:>9} {:>9} {:>7}",
-        "service", "pid", "state", "age", "heard", "nice", "memory", "turn p99", "received", "sent", "lost"
+        "{:<10} {:>7} {:<9} {:>8} {:>8} {:>7} {:>4} {:>8} {:>9} {:>9} {:>9} {:>7}",
+        "service", "pid", "state", "restarts", "age", "heard", "nice", "memory", "turn p99", "received", "sent", "lost"
     );
     writeln!(text, "{header}").ok();
     for row in &report.services {
@@ -193,10 +232,11 @@ fn describe(report: &SystemReport) -> String {
         let [received, sent, lost] = row.messages;
         writeln!(
             text,
-            "{:<10} {:>7} {:<9} {:>8} {:>7} {:>4} {:>8} {:>9} {received:>9} {sent:>9} {lost:>7}  {}",
+            "{:<10} {:>7} {:<9} {:>8} {:>8} {:>7} {:>4} {:>8} {:>9} {received:>9} {sent:>9} {lost:>7}  {}",
             row.service,
             row.pid,
             if row.alive { row.state.as_str() } else { "gone" },
+            row.restarts,
             or_dash(row.age_s.map(|age| format!("{age:.0} s"))),
             or_dash(row.heard_s.map(|age| format!("{age:.1} s"))),
             or_dash(row.nice.map(|nice| nice.to_string())),
@@ -245,11 +285,14 @@ mod tests {
         let report = SystemReport {
             system: "s".into(),
             folder: "/f".into(),
+            condition: "runs",
             supervisor_pid: 7,
             supervised: false,
             mission: None,
             services: vec![row_here, row_dead],
         };
+        let system = System::create(tempfile::tempdir_in("/dev/shm").expect("tmpfs").path(), "d", 0).expect("made");
+        assert!(describe(&blank(&system, "dead")).contains("doctor --clean"));
         let text = describe(&report);
         assert!(text.contains("world") && text.contains("gone") && text.contains("--clean"), "{text}");
     }

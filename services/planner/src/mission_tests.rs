@@ -193,6 +193,42 @@ fn the_operator_can_stop_land_hold_and_go_on() {
 }
 
 #[test]
+fn a_recalled_mission_lands_and_goes_on_when_it_is_resumed() {
+    for at in [40, 700, 3000, 6000] {
+        let faults = Faults { commands: BTreeMap::from([(at, MissionCommand::Recall)]), ..Faults::default() };
+        let (mut world, end) = fly(short(), faults);
+        assert_eq!((end, world.state.unwrap().phase), (EndReason::None, MissionPhase::Failed.code()), "at {at}");
+        let ends = |record: &Record| matches!(record, Record::Ending { .. } | Record::Over { .. });
+        assert!(!world.journal.iter().any(|entry| ends(&entry.record)), "nothing recorded ends it");
+        world.resume();
+        assert_eq!((world.fly(2000.0), world.keyframes()), (EndReason::Complete, 14), "at {at}");
+        assert!(world.captures.values().all(|&count| count == 1));
+    }
+}
+
+#[test]
+fn a_held_mission_can_be_recalled_and_a_recalled_one_stopped() {
+    let commands = BTreeMap::from([(6000, MissionCommand::Abort), (7000, MissionCommand::Recall)]);
+    let (mut world, end) = fly(short(), Faults { commands, ..Faults::default() });
+    assert_eq!(end, EndReason::None);
+    world.resume();
+    assert_eq!((world.fly(2000.0), world.keyframes()), (EndReason::Complete, 14));
+    let commands = BTreeMap::from([(6000, MissionCommand::Recall), (6050, MissionCommand::Stop)]);
+    assert_eq!(fly(short(), Faults { commands, ..Faults::default() }).1, EndReason::Operator);
+}
+
+#[test]
+fn a_mission_told_to_end_before_it_began_is_over_and_may_be_begun_later() {
+    for command in [MissionCommand::Stop, MissionCommand::Land, MissionCommand::Abort] {
+        let (mut world, end) = fly(short(), Faults { commands: BTreeMap::from([(1, command)]), ..Faults::default() });
+        assert_eq!((end, world.state.unwrap().phase), (EndReason::Operator, MissionPhase::Failed.code()));
+        assert!(world.journal.is_empty(), "nothing was begun");
+        world.resume();
+        assert_eq!((world.fly(2000.0), world.keyframes()), (EndReason::Complete, 14));
+    }
+}
+
+#[test]
 fn a_pilot_is_waited_for() {
     let (world, end) = fly(short(), Faults { pilot: Some(5000), ..Faults::default() });
     assert_eq!((end, world.keyframes()), (EndReason::Complete, 14));

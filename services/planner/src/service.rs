@@ -69,9 +69,9 @@ impl Service for Planner {
         self.turns += 1;
         let mut inputs = self.ports.receive(now_ns)?;
         if self.stopping {
-            // As if the operator had said stop; said once, and harmless after that.
+            // Not the operator's stop: he may only want this process away, and the mission goes on after that.
             self.stopping = false;
-            inputs.commands.push((usize::MAX, MissionCommand::Stop));
+            inputs.commands.push((usize::MAX, MissionCommand::Recall));
         }
         let outputs = self.mission.step(now_ns, inputs, &mut self.views);
         self.journal.append(&outputs.entries).map_err(|error| {
@@ -110,12 +110,17 @@ impl Service for Planner {
     }
 
     fn stop(&mut self, _now_ns: u64) -> StopAnswer {
-        // In the air the vehicle is brought home first; on the ground the journal says how to go on.
+        // In the air the vehicle is brought home first; the journal says how to go on.
         if self.mission.on_ground() || self.mission.is_over() {
             return StopAnswer::Now;
         }
         self.stopping = true;
         self.leaving = true;
         StopAnswer::Later
+    }
+
+    fn orphaned(&mut self, _now_ns: u64) -> StopAnswer {
+        // px4-link brings the vehicle home by itself. With nothing recorded that ends it, `resume` goes on.
+        StopAnswer::Now
     }
 }

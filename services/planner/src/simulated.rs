@@ -167,6 +167,11 @@ impl World {
         panic!("not over after {limit_s} s: {:?}, last {:?}", mission.state(), self.journal.last());
     }
 
+    /// Another planner for the same folder: its journal is all that it knows.
+    pub fn resume(&mut self) {
+        self.mission = Some(Mission::new(self.setup.clone(), &self.journal));
+    }
+
     pub fn keyframes(&self) -> usize {
         self.stored.0.keys().filter(|(code, _)| *code == 0).count()
     }

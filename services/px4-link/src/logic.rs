@@ -311,12 +311,15 @@ impl Core {
 
     /// Asked to end. True when that must wait until the vehicle has landed.
     pub fn stop(&mut self, now_ns: u64) -> bool {
-        if !self.flies_for_us() {
-            return false;
+        if self.flies_for_us() {
+            self.leaving = true;
+            self.go_home(now_ns, None);
+        } else if self.telemetry.armed && self.commander == Commander::Vantage {
+            // Armed and about to take off: a landing disarms it where it stands, or brings it down if it is just leaving.
+            self.leaving = true;
+            self.begin(now_ns, VehicleCommand::Land, 0.0, None);
         }
-        self.leaving = true;
-        self.go_home(now_ns, None);
-        true
+        self.leaving
     }
 
     /// Whether a stop that had to wait can end now.

@@ -420,3 +420,20 @@ fn leaving_in_the_air_waits_for_the_ground() {
     assert_eq!((rig.state().armed, rig.state().commander), (0, Commander::Nobody.code()));
     assert!(rig.simulator.truth().position_m.truncate().length() < 0.4);
 }
+
+#[test]
+fn leaving_between_arming_and_the_climb_waits_for_the_disarming() {
+    for ticks in [0, 5, 60, 150] {
+        let mut rig = rig();
+        rig.until("ready", 60, |rig| rig.state().ready == 1 && rig.state().armable == 1);
+        rig.request(VehicleCommand::Arm);
+        rig.until("armed", 10, |rig| rig.state().armed == 1 && rig.state().commander == Commander::Vantage.code());
+        if ticks > 0 {
+            rig.request(VehicleCommand::Takeoff);
+            (0..ticks).for_each(|_| rig.tick(true));
+        }
+        assert!(rig.core.stop(rig.now_ns), "armed: leaving waits ({ticks} ticks after the takeoff's request)");
+        rig.until("may leave", 60, |rig| rig.core.may_leave());
+        assert_eq!(rig.state().armed, 0);
+    }
+}

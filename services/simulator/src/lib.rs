@@ -64,12 +64,15 @@ pub enum SimulatorError {
 }
 
 impl SimulatorError {
-    /// Exit code of a process that ends with this: 69 where something needed is missing, 70 otherwise.
+    /// Exit code of a process that ends with this: 69 where something needed is missing, 64 where what it was given cannot be
+    /// used, 70 otherwise.
     #[must_use]
     pub fn exit_code(&self) -> u8 {
         match self {
             Self::Ports(_) | Self::MembersMissing { .. } => 69,
-            Self::Service(_) => 70,
+            Self::Service(ServiceError::Bus(_)) => 69,
+            Self::Service(ServiceError::Unusable(_)) => 64,
+            Self::Service(ServiceError::Other(_)) => 70,
         }
     }
 }

@@ -38,8 +38,10 @@ pub struct SimulatorService {
     started: Instant,
     /// Wall mode: mission time of boot.
     boot_at_ns: Option<u64>,
-    /// The supervisor is gone: leave once the vehicle has landed and px4-link has left.
-    orphaned: bool,
+    /// Since when the supervisor is gone: leave once the vehicle has landed and px4-link has left.
+    orphaned: Option<Instant>,
+    /// What a vehicle gets to come home without a supervisor.
+    patience: Duration,
 }
 
 fn other(error: &dyn core::fmt::Display) -> ServiceError {
@@ -85,7 +87,8 @@ impl SimulatorService {
             epoch_ns: context.config.mission.epoch_ns,
             started: Instant::now(),
             boot_at_ns: None,
-            orphaned: false,
+            orphaned: None,
+            patience: Duration::try_from_secs_f64(context.config.launch.landing_timeout_s).unwrap_or(Duration::MAX),
         })
     }
 
@@ -101,8 +104,11 @@ impl SimulatorService {
         self.state == State::Running && self.clock.deterministic()
     }
 
-    /// Whether a vehicle is in the air, or its link still works on the clock.
+    /// Whether a vehicle is in the air that somebody can still bring home, or its link still works on the clock.
     fn is_needed(&self) -> bool {
+        if self.clock.link_died() || self.orphaned.is_some_and(|since| since.elapsed() > self.patience) {
+            return false;
+        }
         let link = ServiceName::Px4Link.code();
         self.simulator.vehicle().autopilot.armed() || self.clock.processes().any(|(code, _, _)| code == link)
     }
@@ -144,11 +150,12 @@ impl SimulatorService {
             self.pending.push_back((received.link, received.bytes.to_vec()));
         }
         let (read, wall_ns) = (self.links.received_onboard(), self.wall_ns());
+        // Who has ended is looked at first: the grants read after that are all that it ever sent.
+        let mut gone = self.watch.ended();
         for grant in self.ports.take_grants()? {
             self.clock.on_grant(&grant, read, wall_ns);
         }
-        let mut gone = self.watch.follow(self.clock.processes());
-        gone.extend(self.watch.ended());
+        gone.extend(self.watch.follow(self.clock.processes()));
         for (code, incarnation) in gone {
             self.clock.on_gone(code, incarnation);
         }
@@ -225,7 +232,7 @@ impl SimulatorService {
 
 impl Service for SimulatorService {
     fn step(&mut self, now_ns: u64) -> Result<Step, ServiceError> {
-        if self.orphaned && !self.is_needed() {
+        if self.orphaned.is_some() && !self.is_needed() {
             return Ok(Step::Leave);
         }
         match self.state {
@@ -236,7 +243,7 @@ impl Service for SimulatorService {
     }
 
     fn orphaned(&mut self, _now_ns: u64) -> StopAnswer {
-        self.orphaned = true;
+        self.orphaned = Some(Instant::now());
         if self.is_needed() { StopAnswer::Later } else { StopAnswer::Now }
     }
 

@@ -167,8 +167,10 @@ impl World {
         let outcome = match self.building.try_recv() {
             Err(TryRecvError::Empty) => return Ok(()),
             Ok(Ok(scene)) => Ok(scene),
-            Ok(Err(error)) => Err(error.to_string()),
-            Err(TryRecvError::Disconnected) => Err("the thread that builds the scene ended; see the log".to_owned()),
+            Ok(Err(error)) => Err(ServiceError::Unusable(error.to_string())),
+            Err(TryRecvError::Disconnected) => {
+                Err(ServiceError::Other("the thread that builds the scene ended; see the log".to_owned()))
+            }
         };
         match outcome {
             Ok(scene) => {
@@ -179,7 +181,7 @@ impl World {
             }
             Err(error) => {
                 self.state = self.state.after(Event::BuildFailed);
-                Err(ServiceError::Other(error))
+                Err(error)
             }
         }
     }

@@ -9,7 +9,7 @@ use crate::payload;
 
 payload! {
     /// What every message says of itself.
-    pub struct Envelope {
+    pub struct Envelope [56] {
         /// Mission time of what it describes.
         pub stamp_ns: u64,
         /// Mission time when it was sent; 0 from commands outside the mission's clock.

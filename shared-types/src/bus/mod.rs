@@ -25,7 +25,7 @@ pub use request::{Client, ReplyAddress, Server};
 pub use subscriber::Subscriber;
 pub use wait::{Listener, wait};
 
-use crate::channel::{Channel, ItemLimit, MAX_NODES, MAX_PUBLISHERS, MAX_SUBSCRIBERS, RequestChannel};
+use crate::channel::{Channel, ItemLimit, MAX_NODES, MAX_PUBLISHERS, MAX_SUBSCRIBERS, RequestChannel, Settings};
 use crate::config::Config;
 use crate::service::ServiceName;
 use crate::system::System;
@@ -35,6 +35,9 @@ pub(crate) type Ipc = ipc::Service;
 type Factory<C> = PortFactory<Ipc, [<C as Channel>::Item], Framed<<C as Channel>::Header>>;
 type RawPublisher<C> =
     iceoryx2::port::publisher::Publisher<Ipc, [<C as Channel>::Item], Framed<<C as Channel>::Header>>;
+
+/// What iceoryx2 adds to each chunk: its own header, and alignment.
+const CHUNK_BYTES: usize = 64;
 
 /// What large messages may measure, from the configuration.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -57,6 +60,16 @@ impl Limits {
             small_depth_bytes: pixels(config.camera.depth_width_px, config.camera.depth_height_px) * 2,
             gaussians: config.model.max_gaussians as usize,
         }
+    }
+
+    /// Bytes of shared memory that the senders of a channel reserve in a mission.
+    #[must_use]
+    pub fn reserved_bytes<C: Channel>(&self) -> u64 {
+        let Settings { queue, history, chunks, senders, .. } = C::SETTINGS;
+        // As iceoryx2 counts: what every reader may keep and hold, the history, and the one being written.
+        let worst = MAX_SUBSCRIBERS * (queue.max(history).max(1) + queue + 2) + history + 1;
+        let chunk = CHUNK_BYTES + size_of::<Framed<C::Header>>() + self.items(C::SETTINGS.items) * size_of::<C::Item>();
+        (senders * chunks.map_or(worst, |chunks| worst.min(chunks)) * chunk) as u64
     }
 
     fn items(&self, limit: ItemLimit) -> usize {
@@ -236,14 +249,12 @@ impl Bus {
         let key = "schema".try_into().map_err(|e| failed(format!("{e:?}")))?;
         let value = schema.as_str().try_into().map_err(|e| failed(format!("{e:?}")))?;
         let required = AttributeVerifier::new().require(&key, &value).map_err(|e| failed(format!("{e:?}")))?;
-        let alignment = Alignment::new(align_of::<C::Item>().max(8)).ok_or_else(|| failed("alignment".to_owned()))?;
         let open = || {
             self.0
                 .node
                 .service_builder(&name)
                 .publish_subscribe::<[C::Item]>()
                 .user_header::<Framed<C::Header>>()
-                .payload_alignment(alignment)
                 .enable_safe_overflow(true)
                 .history_size(C::SETTINGS.history)
                 .subscriber_max_buffer_size(C::SETTINGS.queue.max(C::SETTINGS.history).max(1))

@@ -167,3 +167,45 @@ fn waiting_ends_with_a_message_and_not_before() {
     wait(&[&listener], &[], std::time::Duration::from_millis(1)).expect("over");
     assert_eq!(Rc::strong_count(&domain.join(ServiceName::Command, false).0), 1);
 }
+
+/// Opens a sender of every channel, and adds up what the table says and what lies in shared memory.
+struct SendAll<'a> {
+    bus: &'a Bus,
+    limits: Limits,
+    prefix: &'a str,
+    worst: f64,
+    ports: Vec<Box<dyn core::any::Any>>,
+}
+
+impl crate::channel::ChannelVisitor for SendAll<'_> {
+    fn visit<C: Channel>(&mut self) {
+        let before = data_bytes(self.prefix);
+        self.ports.push(Box::new(self.bus.publisher::<C>().expect("publisher")));
+        let taken = (data_bytes(self.prefix) - before) * C::SETTINGS.senders as u64;
+        let told = self.limits.reserved_bytes::<C>();
+        println!("{}: {taken} taken, {told} told", C::NAME);
+        self.worst = self.worst.max((taken as f64 / told as f64).max(told as f64 / taken as f64));
+    }
+}
+
+fn data_bytes(prefix: &str) -> u64 {
+    std::fs::read_dir("/dev/shm")
+        .expect("shm")
+        .flatten()
+        .filter(|entry| {
+            let name = entry.file_name().to_string_lossy().into_owned();
+            name.starts_with(prefix) && name.ends_with(".data")
+        })
+        .map(|entry| entry.metadata().map_or(0, |data| data.len()))
+        .sum()
+}
+
+#[test]
+fn what_the_channels_reserve_is_known_before_they_are_opened() {
+    let domain = Domain::new();
+    let limits = Limits::of(&crate::config::preset("tiny").expect("preset"));
+    let bus = Bus::open(&domain.system, limits, ServiceName::Command, 1, false).expect("bus");
+    let mut all = SendAll { bus: &bus, limits, prefix: &domain.system.prefix, worst: 1.0, ports: Vec::new() };
+    crate::channel::visit_all(&mut all);
+    assert!(all.worst < 1.3, "{}", all.worst);
+}

@@ -16,7 +16,7 @@ pub struct LaunchConfig {
     pub crash_limit: u32,
     /// Window of `crash_limit`, seconds.
     pub crash_window_s: f64,
-    /// Time that each service gets to stop in order before it is killed, seconds.
+    /// Time that each service gets to stop in order before it is killed, seconds; the trainer takes up to 8 for a checkpoint.
     pub stop_timeout_s: f64,
     /// Time that a mission gets to return, land and save after the first Ctrl-C, seconds.
     pub landing_timeout_s: f64,
@@ -35,7 +35,7 @@ impl Default for LaunchConfig {
             restart_delay_max_s: 5.0,
             crash_limit: 5,
             crash_window_s: 30.0,
-            stop_timeout_s: 5.0,
+            stop_timeout_s: 10.0,
             landing_timeout_s: 180.0,
             memory_period_s: 2.0,
             log_level: "info".to_owned(),

@@ -85,6 +85,8 @@ pub enum FolderError {
     },
 }
 
+const SUBFOLDERS: [&str; 4] = ["keyframes", "prior", "model", "report"];
+
 /// A mission folder.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct MissionFolder {
@@ -97,14 +99,47 @@ impl MissionFolder {
     /// # Errors
     /// [`FolderError::HoldsMission`] where one lies already; [`FolderError::Io`] where the folder cannot be made.
     pub fn create(root: impl AsRef<Path>) -> Result<Self, FolderError> {
-        let folder = Self { root: absolute(root.as_ref())? };
+        let folder = Self::vacant(root.as_ref())?;
+        folder.make_subfolders()?;
+        Ok(folder)
+    }
+
+    /// As [`Self::create`], with `mission.toml` before everything else, so that what a kill leaves can be resumed. On an
+    /// error, what was made is taken away again: the same command may be given once more.
+    ///
+    /// # Errors
+    /// As [`Self::create`]; [`FolderError::Full`] where the disk is.
+    pub fn create_with(root: impl AsRef<Path>, config: &str) -> Result<Self, FolderError> {
+        let folder = Self::vacant(root.as_ref())?;
+        let fresh = !folder.root.exists();
+        let made = files::create_dir_durable(&folder.root)
+            .and_then(|()| write_atomic(&folder.config_path(), config.as_bytes()))
+            .and_then(|()| folder.make_subfolders());
+        if let Err(error) = made {
+            // Only what is empty or was written here: as far as it goes, the first error is the one to tell.
+            for sub in SUBFOLDERS {
+                std::fs::remove_dir(folder.root.join(sub)).ok();
+            }
+            std::fs::remove_file(folder.config_path()).ok();
+            if fresh {
+                std::fs::remove_dir(&folder.root).ok();
+            }
+            return Err(error);
+        }
+        Ok(folder)
+    }
+
+    fn make_subfolders(&self) -> Result<(), FolderError> {
+        SUBFOLDERS.iter().try_for_each(|sub| files::create_dir_durable(&self.root.join(sub)))
+    }
+
+    /// The folder of a mission that is yet to be made.
+    fn vacant(root: &Path) -> Result<Self, FolderError> {
+        let folder = Self { root: absolute(root)? };
         for found in ["mission.toml", "journal.jsonl", "keyframes", "prior", "model"] {
             if folder.root.join(found).exists() {
                 return Err(FolderError::HoldsMission { root: folder.root, found });
             }
-        }
-        for sub in ["keyframes", "prior", "model", "report"] {
-            files::create_dir_durable(&folder.root.join(sub))?;
         }
         Ok(folder)
     }
@@ -202,6 +237,18 @@ mod tests {
         assert_eq!(MissionFolder::open(&root).expect("open"), made);
         let message = MissionFolder::create(&root).expect_err("holds one").to_string();
         assert!(message.contains("vantage resume") && message.contains(&root.display().to_string()), "{message}");
+    }
+
+    #[test]
+    fn what_could_not_be_made_whole_leaves_no_mission() {
+        let dir = tempfile::tempdir().expect("tempdir");
+        // A file in the way of the last subfolder.
+        std::fs::write(dir.path().join("report"), "mine").expect("write");
+        MissionFolder::create_with(dir.path(), "a = 1\n").expect_err("a file is in the way");
+        assert_eq!(std::fs::read_dir(dir.path()).expect("there").count(), 1, "all but the file is gone");
+        std::fs::remove_file(dir.path().join("report")).expect("out of the way");
+        let folder = MissionFolder::create_with(dir.path(), "a = 1\n").expect("the same command again");
+        assert_eq!(std::fs::read(folder.config_path()).expect("written"), b"a = 1\n");
     }
 
     #[test]

@@ -25,7 +25,7 @@ payload! {
     /// Header of `camera/frame`, `camera/depth` and `camera/keyframe`. The items are `width * height * 3` bytes of sRGB
     /// colour (none on `camera/depth`), row by row, then `width * height` little-endian u16 of depth (centre z in units of
     /// `depth_unit_m`, 0 = no measurement). See [`FrameView`].
-    pub struct FrameHeader {
+    pub struct FrameHeader [152] {
         /// Keyframe id; of the stream, a counter.
         pub id: u64,
         /// Pose of the camera (optical: x right, y down, z forward) in the world at the image's stamp: position, metres.
@@ -164,7 +164,7 @@ impl<'a> FrameView<'a> {
 
 payload! {
     /// Request of `camera/capture`.
-    pub struct CaptureRequest {
+    pub struct CaptureRequest [56] {
         /// Keyframe id: the folder's number under `keyframes/`. The same id is answered from disk.
         pub keyframe_id: u64,
         /// The target whose end is the view; the camera waits until `vehicle/state` says that it arrived. 0: any.
@@ -196,7 +196,7 @@ codes! {
 
 payload! {
     /// Reply of `camera/capture`.
-    pub struct CaptureReply {
+    pub struct CaptureReply [144] {
         /// Keyframe id of the request.
         pub keyframe_id: u64,
         /// Mission time of the image.

@@ -7,7 +7,7 @@ pub const MAX_SERVICES: usize = 16;
 
 payload! {
     /// `clock`: the present tick; a whole state, sent again every 100 ms of wall time.
-    pub struct ClockTick {
+    pub struct ClockTick [104] {
         /// Which life of the simulator this is.
         pub incarnation: u64,
         /// Tick number; tick k is the instant k x 10 ms (plus `epoch_ns`).
@@ -25,7 +25,7 @@ payload! {
 
 payload! {
     /// `clock/grant`: a member has finished a tick; a whole state, sent again every 100 ms of wall time.
-    pub struct ClockGrant {
+    pub struct ClockGrant [56] {
         /// Incarnation of the clock that is granted.
         pub clock_incarnation: u64,
         /// Tick that is finished.

@@ -20,7 +20,7 @@ codes! {
 
 payload! {
     /// `health` and `health/last`: once a second from every service.
-    pub struct Health {
+    pub struct Health [240] {
         /// Which life of the service this is (its start, monotonic nanoseconds).
         pub incarnation: u64,
         /// Turns of the work loop.
@@ -43,8 +43,8 @@ payload! {
         pub pid: u32,
         /// [`ServiceState`] code.
         pub state: u32,
-        /// Unused, zero.
-        pub reserved: u32,
+        /// In `health/last`: how often the service was started again since the keeper first heard of it.
+        pub restarts: u32,
         /// What went wrong last; text.
         pub last_error: [u8; 160],
     }
@@ -64,7 +64,7 @@ codes! {
 
 payload! {
     /// Request of `control/<service>`.
-    pub struct ControlRequest {
+    pub struct ControlRequest [16] {
         /// [`ControlCommand`] code.
         pub command: u32,
         /// See the command.
@@ -78,7 +78,7 @@ payload! {
 
 payload! {
     /// Reply of `control/<service>`.
-    pub struct ControlReply {
+    pub struct ControlReply [8] {
         /// 1 when done, 0 when refused.
         pub accepted: u32,
         /// [`crate::ServiceName`] code of the service that answers.

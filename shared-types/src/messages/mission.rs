@@ -83,12 +83,14 @@ codes! {
         Land = 4, "land",
         /// Go on after a pilot or a failsafe.
         GoOn = 5, "go-on",
+        /// Return and land, and leave the mission open: it goes on with `vantage resume`.
+        Recall = 6, "recall",
     }
 }
 
 payload! {
     /// Request of `mission/command`.
-    pub struct MissionRequest {
+    pub struct MissionRequest [8] {
         /// [`MissionCommand`] code.
         pub command: u32,
         /// Unused, zero.
@@ -98,7 +100,7 @@ payload! {
 
 payload! {
     /// Reply of `mission/command`.
-    pub struct MissionReply {
+    pub struct MissionReply [128] {
         /// 1 when accepted, 0 when refused.
         pub accepted: u32,
         /// Unused, zero.
@@ -110,7 +112,7 @@ payload! {
 
 payload! {
     /// `mission/state`: sent on every change, kept for late joiners. The items are the candidates.
-    pub struct MissionState {
+    pub struct MissionState [448] {
         /// Counts the changes.
         pub sequence: u64,
         /// Mission time when it began (after the clock started).
@@ -170,7 +172,7 @@ codes! {
 
 payload! {
     /// One candidate view in `mission/state`.
-    pub struct CandidateState {
+    pub struct CandidateState [40] {
         /// Camera position in the world, metres.
         pub position_m: [f64; 3],
         /// Combined score (Eq. 4) when last scored; 0 before.

@@ -4,7 +4,7 @@ use crate::{codes, payload};
 
 payload! {
     /// Request of `trainer/round`; the items are the keyframe ids (u64) to train on, all of which lie in the mission folder.
-    pub struct RoundRequest {
+    pub struct RoundRequest [72] {
         /// Number of the round, from 0 (the seed views).
         pub round: u32,
         /// Most iterations (Eq. 6).
@@ -40,7 +40,7 @@ codes! {
 
 payload! {
     /// Reply of `trainer/round`: several `Progress`, then one `Done` or `Failed`.
-    pub struct RoundReply {
+    pub struct RoundReply [168] {
         /// Generation of the final snapshot; 0 before `Done`.
         pub generation: u64,
         /// Gaussians in the model.
@@ -64,7 +64,7 @@ payload! {
 
 payload! {
     /// Header of `model/snapshot`; the items are the Gaussians.
-    pub struct SnapshotHeader {
+    pub struct SnapshotHeader [64] {
         /// Increases with every snapshot of a mission, over restarts too.
         pub generation: u64,
         /// Training iterations behind it.
@@ -86,7 +86,7 @@ payload! {
 
 payload! {
     /// One Gaussian, as on channels and in checkpoints.
-    pub struct GaussianRow {
+    pub struct GaussianRow [72] {
         /// Centre in the world, metres.
         pub mean_m: [f32; 3],
         /// Natural logarithms of the standard deviations along the own axes, metres.

@@ -14,7 +14,7 @@ codes! {
 
 payload! {
     /// Request of `scorer/score`; the items are the candidates and the visited views.
-    pub struct ScoreRequest {
+    pub struct ScoreRequest [112] {
         /// Snapshot to score on.
         pub generation: u64,
         /// Round the scores are for.
@@ -46,7 +46,7 @@ payload! {
 
 payload! {
     /// A view in a scoring request.
-    pub struct CandidateView {
+    pub struct CandidateView [64] {
         /// Camera position in the world, metres.
         pub position_m: [f64; 3],
         /// Camera (optical) attitude in the world.
@@ -74,7 +74,7 @@ codes! {
 
 payload! {
     /// Reply of `scorer/score`; the items are the scores, in the order of the request's candidates.
-    pub struct ScoreReply {
+    pub struct ScoreReply [160] {
         /// Snapshot that was scored.
         pub generation: u64,
         /// Newest final snapshot that the scorer holds.
@@ -94,7 +94,7 @@ payload! {
 
 payload! {
     /// Every term of one candidate's score.
-    pub struct CandidateScore {
+    pub struct CandidateScore [72] {
         /// Mean of the pixels' depth variances inside the projected box, m^2 (Eq. 3).
         pub mean_variance_m2: f64,
         /// Area of the projected box over the image's (Eq. 3).

@@ -4,7 +4,7 @@ use crate::{codes, payload};
 
 payload! {
     /// `simulator/truth`: once per tick.
-    pub struct Truth {
+    pub struct Truth [144] {
         /// Mission time.
         pub now_ns: u64,
         /// True position of the body in the world, metres.
@@ -34,7 +34,7 @@ codes! {
 
 payload! {
     /// Request of `simulator/render`.
-    pub struct RenderRequest {
+    pub struct RenderRequest [56] {
         /// Mission time whose true camera pose is rendered; at most 5 s old.
         pub image_stamp_ns: u64,
         /// Focal lengths, pixels.
@@ -66,7 +66,7 @@ codes! {
 
 payload! {
     /// Reply of `simulator/render`; the items are as on `camera/frame` (colour unless the purpose is depth, then depth).
-    pub struct RenderReply {
+    pub struct RenderReply [40] {
         /// Stamp of the request.
         pub image_stamp_ns: u64,
         /// Metres per unit of depth.

@@ -6,7 +6,7 @@ payload! {
     /// `vehicle/state`: what px4-link knows of the vehicle. World is ENU; body is FLU (x forward, y left, z up).
     ///
     /// The envelope's `stamp_ns` is `position_stamp_ns`. Vectors of a part that was never received are zero with a stamp of 0.
-    pub struct VehicleState {
+    pub struct VehicleState [376] {
         /// Which life of px4-link wrote this; differs after a restart.
         pub incarnation: u64,
         /// Mission time of `position_m` and `velocity_mps`.
@@ -169,7 +169,7 @@ codes! {
 payload! {
     /// `vehicle/target`: a path to fly. The items are `path_len` waypoints of the path, then `return_len` waypoints of the
     /// checked way back from its end to above the landing point.
-    pub struct VehicleTarget {
+    pub struct VehicleTarget [64] {
         /// Increases with every target of a mission; never used twice.
         pub id: u64,
         /// Lowest corner of the volume that no setpoint leaves, metres.
@@ -185,7 +185,7 @@ payload! {
 
 payload! {
     /// One point of a path.
-    pub struct Waypoint {
+    pub struct Waypoint [48] {
         /// In the world, metres.
         pub position_m: [f64; 3],
         /// Yaw at this point (ENU: from east, counter-clockwise), radians; interpolated along the leg.
@@ -219,7 +219,7 @@ codes! {
 
 payload! {
     /// Request of `vehicle/command`.
-    pub struct CommandRequest {
+    pub struct CommandRequest [16] {
         /// [`VehicleCommand`] code.
         pub command: u32,
         /// Unused, zero.
@@ -245,7 +245,7 @@ codes! {
 
 payload! {
     /// Reply of `vehicle/command`; `Accepted` may be followed by another reply to the same request.
-    pub struct CommandReply {
+    pub struct CommandReply [128] {
         /// [`CommandStatus`] code.
         pub status: u32,
         /// [`VehicleCommand`] code of the request.
@@ -257,7 +257,7 @@ payload! {
 
 payload! {
     /// `planner/alive`: the planner's loop turns.
-    pub struct Alive {
+    pub struct Alive [8] {
         /// Counts the turns of the work loop.
         pub sequence: u64,
     }

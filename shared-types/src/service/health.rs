@@ -86,7 +86,7 @@ impl HealthSender {
             service: context.name.code(),
             pid: std::process::id(),
             state: state.code(),
-            reserved: 0,
+            restarts: 0,
             last_error: pack_text(&report.last_error),
         };
         self.turn_ns.clear();

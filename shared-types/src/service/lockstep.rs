@@ -11,6 +11,8 @@ use crate::messages::{ClockGrant, ClockTick};
 const IDLE: Duration = Duration::from_millis(100);
 const WAITING: Duration = Duration::from_millis(2);
 const RESEND_NS: u64 = 100_000_000;
+/// The clock sends its state every 100 ms of wall time: without one for this long, nobody makes time any more.
+const CLOCK_GONE_NS: u64 = 2_000_000_000;
 
 struct Grants {
     publisher: Publisher<GrantChannel>,
@@ -46,12 +48,14 @@ pub(super) fn run(context: &mut Context, service: &mut impl Service) -> Result<(
     };
     let mut present: Option<ClockTick> = None;
     let mut granted = true;
+    let mut heard_ns = monotonic_ns();
     loop {
         let timeout = if granted { IDLE } else { WAITING };
         wait(&[&listener], &[], timeout)?;
         if let Some(message) = ticks.latest(0)? {
             let tick = *message.header();
             drop(message);
+            heard_ns = monotonic_ns();
             let fresh = match &present {
                 None => true,
                 Some(old) if old.incarnation != tick.incarnation => {
@@ -101,6 +105,11 @@ pub(super) fn run(context: &mut Context, service: &mut impl Service) -> Result<(
         if housekeeping.turn(context, service, now_ns)? {
             grants.newest.leaving = 1;
             return grants.send();
+        }
+        // What is to be finished first takes mission time, and there will be none.
+        if housekeeping.stopping() && monotonic_ns().saturating_sub(heard_ns) > CLOCK_GONE_NS {
+            tracing::warn!(service = %context.name, "the mission clock is gone: leaving at once");
+            return Ok(());
         }
     }
 }

@@ -20,7 +20,7 @@ use crate::bus::{Bus, BusError, Limits, Listener};
 use crate::codes;
 use crate::config::{ClockMode, Config};
 use crate::messages::ClockTick;
-use crate::system::System;
+use crate::system::{Hold, System};
 use control::Control;
 use health::HealthSender;
 use signals::StopSignals;
@@ -68,6 +68,9 @@ pub enum ServiceError {
     /// The bus failed.
     #[error(transparent)]
     Bus(#[from] BusError),
+    /// What the service was given cannot be used (a mesh, a setting): the same start would fail the same way.
+    #[error("{0}")]
+    Unusable(String),
     /// Something else; the text names it, what was expected, and the way out.
     #[error("{0}")]
     Other(String),
@@ -162,24 +165,40 @@ pub struct Context {
     pub incarnation: u64,
     /// Whether a supervisor is to be watched: the loop stops the service when it is gone.
     pub supervised: bool,
+    /// While this lives, the system is not taken for dead.
+    _hold: Hold,
 }
 
 impl Context {
     /// Joins a system as a service.
     ///
     /// # Errors
-    /// When the bus cannot be joined.
+    /// When the system has ended, or its bus cannot be joined.
     pub fn open(name: ServiceName, config: Config, system: System, supervised: bool) -> Result<Self, BusError> {
+        let hold = system
+            .hold()
+            .map_err(|error| BusError::Domain { path: system.runtime_dir.clone(), cause: error.to_string() })?;
         let incarnation = wall::monotonic_ns();
         let by_tick = name.is_member() && config.clock.mode == ClockMode::Lockstep;
         let bus = Bus::open(&system, Limits::of(&config), name, incarnation, by_tick)?;
-        Ok(Self { name, bus, config, system, incarnation, supervised })
+        Ok(Self { name, bus, config, system, incarnation, supervised, _hold: hold })
     }
 
     /// Whether this service grants the ticks of a simulated clock.
     #[must_use]
     pub fn lockstep(&self) -> bool {
         self.name.is_member() && self.config.clock.mode == ClockMode::Lockstep
+    }
+
+    /// The supervisor to be watched; `None` without one.
+    fn supervisor(&self) -> Option<u32> {
+        (self.supervised && self.system.supervisor_pid != 0).then_some(self.system.supervisor_pid)
+    }
+
+    /// Whether the supervisor is gone. The loop sees to it by itself; for what a service waits for before its loop.
+    #[must_use]
+    pub fn orphaned(&self) -> bool {
+        self.supervisor().is_some_and(signals::is_gone)
     }
 
     /// Runs a service until it leaves: on the mission clock in lockstep, else on the machine's.
@@ -197,12 +216,23 @@ impl Context {
     }
 }
 
+/// Who wants this service to stop.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+enum Stopping {
+    /// Nobody.
+    No,
+    /// The supervisor is gone.
+    Orphaned,
+    /// SIGTERM or `control` came.
+    Asked,
+}
+
 /// What both loops do besides turns.
 struct Housekeeping {
     control: Control,
     health: HealthSender,
     signals: StopSignals,
-    stopping: bool,
+    stopping: Stopping,
     last: u64,
 }
 
@@ -213,10 +243,15 @@ impl Housekeeping {
         Ok(Self {
             control: Control::open(context)?,
             health: HealthSender::open(context)?,
-            signals: StopSignals::install(context.supervised)?,
-            stopping: false,
+            signals: StopSignals::install(context.supervisor())?,
+            stopping: Stopping::No,
             last: 0,
         })
+    }
+
+    /// Whether this service has been told to stop and finishes something first.
+    fn stopping(&self) -> bool {
+        self.stopping != Stopping::No
     }
 
     /// Late joiners, control, health and stop requests, at most every 100 ms of wall time. True when the service leaves now.
@@ -227,23 +262,24 @@ impl Housekeeping {
         }
         self.last = wall_ns;
         context.bus.serve_late_joiners();
-        let asked = self.control.turn(context, now_ns)?;
-        self.health.turn(context, service, now_ns, wall_ns, self.stopping)?;
-        if self.stopping {
+        let asked = self.control.turn(context, now_ns)? || self.signals.take();
+        self.health.turn(context, service, now_ns, wall_ns, self.stopping())?;
+        let wanted = match (asked, self.signals.orphaned()) {
+            (true, _) => Stopping::Asked,
+            (false, true) => Stopping::Orphaned,
+            (false, false) => Stopping::No,
+        };
+        // Who was orphaned and finishes something first can still be asked to stop; the same is said once.
+        if wanted <= self.stopping {
             return Ok(false);
         }
-        let asked = asked || self.signals.raised();
-        self.stopping = asked || self.signals.orphaned();
-        Ok(match (self.stopping, asked) {
-            (false, _) => false,
-            (true, true) => {
-                tracing::info!(service = %context.name, "asked to stop");
-                service.stop(now_ns) == StopAnswer::Now
-            }
-            (true, false) => {
-                tracing::warn!(service = %context.name, "the supervisor is gone");
-                service.orphaned(now_ns) == StopAnswer::Now
-            }
+        self.stopping = wanted;
+        Ok(if wanted == Stopping::Asked {
+            tracing::info!(service = %context.name, "asked to stop");
+            service.stop(now_ns) == StopAnswer::Now
+        } else {
+            tracing::warn!(service = %context.name, "the supervisor is gone");
+            service.orphaned(now_ns) == StopAnswer::Now
         })
     }
 }

@@ -57,13 +57,14 @@ impl Starter {
 pub struct Children {
     starter: Starter,
     running: BTreeMap<ServiceName, Child>,
+    in_the_air: bool,
 }
 
 impl Children {
     /// None yet.
     #[must_use]
     pub fn new(starter: Starter) -> Self {
-        Self { starter, running: BTreeMap::new() }
+        Self { starter, running: BTreeMap::new(), in_the_air: false }
     }
 
     /// Starts a service.
@@ -74,6 +75,11 @@ impl Children {
         let child = self.starter.start(service)?;
         self.running.insert(service, child);
         Ok(())
+    }
+
+    /// Whether the vehicle is armed: then nobody is killed by accident.
+    pub fn set_in_the_air(&mut self, in_the_air: bool) {
+        self.in_the_air = in_the_air;
     }
 
     /// Process ids.
@@ -130,8 +136,12 @@ impl Children {
 }
 
 impl Drop for Children {
-    /// Nobody outlives the supervisor by accident: on an error path, what still runs is killed and reaped.
+    /// On an error path, with the vehicle on the ground, what still runs is killed and reaped. In the air everybody is
+    /// left alone: they notice that the supervisor is gone, bring the vehicle home and end.
     fn drop(&mut self) {
+        if self.in_the_air {
+            return;
+        }
         for child in self.running.values_mut() {
             if child.kill().is_ok() {
                 child.wait().ok();
@@ -213,6 +223,19 @@ mod tests {
         children.start(ServiceName::Camera).expect("started");
         children.kill(ServiceName::Camera);
         assert_eq!(reap_one(&mut children).2, "signal 9");
+    }
+
+    #[test]
+    fn a_supervisor_that_fails_in_flight_kills_nobody() {
+        let folder = tempfile::tempdir().expect("folder");
+        let mut children = Children::new(script(folder.path(), "exec sleep 60"));
+        children.start(ServiceName::Px4Link).expect("started");
+        children.set_in_the_air(true);
+        let (_, pid) = children.pids()[0];
+        drop(children);
+        assert!(crate::proc::is_alive(pid), "px4-link brings the vehicle home");
+        let pid = Pid::from_raw(i32::try_from(pid).expect("pid")).expect("pid");
+        kill_process(pid, Signal::KILL).expect("killed");
     }
 
     #[test]

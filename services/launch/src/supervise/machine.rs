@@ -2,100 +2,18 @@
 //!
 //! Phases: *Starting* (keeper first, then the rest) -> *Flying* (the dead are started again with a back-off) ->
 //! *Returning* (the first Ctrl-C, or a service that cannot be kept alive: the mission is told to return, land and save)
-//! -> *Stopping* (group by group) -> *Over*. A second Ctrl-C goes to *Stopping* at once.
+//! -> *Stopping* (group by group) -> *Over*. A second Ctrl-C kills at once. Before the motors ever ran there is nothing to
+//! bring home: then the first Ctrl-C, and a service that cannot be kept alive, go to *Stopping* directly.
+
+mod words;
 
 use std::collections::BTreeMap;
 
 use shared_types::ServiceName;
 
+pub use words::{Action, Event, Outcome, Policy};
+
 use super::plan::{START_ORDER, STOP_GROUPS};
-
-/// Limits of the supervisor; times in milliseconds of wall time.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Policy {
-    /// Wait before the first restart; doubles with each further death.
-    pub restart_delay_ms: u64,
-    /// Longest wait before a restart.
-    pub restart_delay_max_ms: u64,
-    /// Deaths within the window that are still mended.
-    pub crash_limit: usize,
-    /// The window.
-    pub crash_window_ms: u64,
-    /// Time to stop in order before SIGKILL.
-    pub stop_timeout_ms: u64,
-    /// Time to return, land and save.
-    pub landing_timeout_ms: u64,
-    /// Time that the keeper gets before the others are started without a word from it.
-    pub keeper_timeout_ms: u64,
-}
-
-/// What happened.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Event {
-    /// Begin.
-    Begin,
-    /// Time passes.
-    Tick,
-    /// The service's health was heard.
-    Heard(ServiceName),
-    /// The process ended.
-    Exited {
-        /// Which one.
-        service: ServiceName,
-        /// Exit code; `None` for a signal.
-        code: Option<i32>,
-    },
-    /// Ctrl-C, or SIGTERM.
-    Interrupt,
-    /// The planner's phase is `Done` (true) or `Failed` (false).
-    MissionOver {
-        /// Whether there is a usable model.
-        usable: bool,
-    },
-    /// The motors are off.
-    Disarmed,
-}
-
-/// What to do.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Action {
-    /// Start the process.
-    Start(ServiceName),
-    /// Ask the process to stop in order (SIGTERM).
-    Ask(ServiceName),
-    /// Kill the process.
-    Kill(ServiceName),
-    /// Tell the planner to return, land and save.
-    CommandStop,
-    /// Tell the vehicle to hold where it is.
-    VehicleHold,
-    /// Tell the user.
-    Say(String),
-    /// All processes are gone.
-    Finish(Outcome),
-}
-
-/// How the run ended.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Outcome {
-    /// The mission landed with a usable model.
-    Done,
-    /// The mission is over without one.
-    Failed,
-    /// The user asked twice to stop: the vehicle was left holding.
-    Aborted,
-    /// A service could not be kept alive or never started.
-    Broken {
-        /// Which one.
-        service: ServiceName,
-        /// Its last exit code; `None` for a signal.
-        code: Option<i32>,
-        /// Whether it ever worked in this run.
-        worked: bool,
-    },
-    /// The vehicle did not land in time after the user asked for it.
-    NotLanded,
-}
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Member {
@@ -107,10 +25,20 @@ enum Member {
 
 #[derive(Debug, Clone, PartialEq, Eq)]
 enum Phase {
-    Starting { since_ms: u64 },
+    Starting {
+        since_ms: u64,
+    },
     Flying,
-    Returning { since_ms: u64 },
-    Stopping { group: usize, since_ms: u64, killed: bool },
+    /// `recalled`: by ourselves, with the mission left open; else by the user, and the mission ends.
+    Returning {
+        since_ms: u64,
+        recalled: bool,
+    },
+    Stopping {
+        group: usize,
+        since_ms: u64,
+        killed: bool,
+    },
     Over,
 }
 
@@ -130,6 +58,10 @@ pub struct Supervisor {
     outcome: Option<Outcome>,
     members: BTreeMap<ServiceName, Record>,
     services: Vec<ServiceName>,
+    /// How often the user asked to end.
+    interrupts: u32,
+    armed: bool,
+    ever_armed: bool,
 }
 
 impl Supervisor {
@@ -139,7 +71,16 @@ impl Supervisor {
         let services: Vec<ServiceName> = START_ORDER.into_iter().filter(|service| services.contains(service)).collect();
         let record = Record { member: Member::NotStarted, deaths_ms: Vec::new(), restarts: 0, heard: false };
         let members = services.iter().map(|service| (*service, record.clone())).collect();
-        Self { policy, phase: Phase::Starting { since_ms: 0 }, outcome: None, members, services }
+        Self {
+            policy,
+            phase: Phase::Starting { since_ms: 0 },
+            outcome: None,
+            members,
+            services,
+            interrupts: 0,
+            armed: false,
+            ever_armed: false,
+        }
     }
 
     /// How often each service was started again; services that never were are left out.
@@ -169,7 +110,9 @@ impl Supervisor {
                     self.stop_group(now_ms, 0, false, &mut actions);
                 }
             }
+            Event::Armed => (self.armed, self.ever_armed) = (true, true),
             Event::Disarmed => {
+                self.armed = false;
                 // Without a planner nobody reports the mission's end: the vehicle on the ground is the end.
                 let planner_gone = self.member(ServiceName::Planner).is_none_or(|member| member == Member::Gone);
                 if matches!(self.phase, Phase::Returning { .. }) && planner_gone {
@@ -231,18 +174,24 @@ impl Supervisor {
         record.deaths_ms.push(now_ms);
         let (deaths, heard) = (record.deaths_ms.len(), record.heard);
         // Bad configuration or something missing: the same start would fail the same way.
-        let refuses = !heard && matches!(code, Some(64 | 69));
+        let refuses = !(heard && self.ever_armed) && matches!(code, Some(64 | 69));
         // The simulator is the vehicle itself: a new one would stand on the ground at time zero.
-        let vehicle_lost = service == ServiceName::Simulator && heard;
+        let vehicle_lost = service == ServiceName::Simulator && heard && !refuses;
         if refuses || vehicle_lost {
             record.member = Member::Gone;
-            self.outcome.get_or_insert(Outcome::Broken { service, code, worked: heard });
+            self.outcome.get_or_insert(Outcome::Broken { service, code, worked: heard && !refuses });
             self.stop_group(now_ms, 0, vehicle_lost, actions);
         } else if deaths > limit {
             record.member = Member::Gone;
             self.outcome.get_or_insert(Outcome::Broken { service, code, worked: heard });
-            actions.push(Action::Say(format!("{service} died {deaths} times in a row: returning and landing")));
-            self.return_home(now_ms, actions);
+            if self.ever_armed {
+                actions.push(Action::Say(format!("{service} died {deaths} times in a row: returning and landing")));
+                self.return_home(now_ms, true, actions);
+            } else {
+                // Nothing is in the air: nobody need wait for a landing.
+                actions.push(Action::Say(format!("{service} died {deaths} times in a row: stopping")));
+                self.stop_group(now_ms, 0, false, actions);
+            }
         } else {
             let doublings = u32::try_from(deaths - 1).unwrap_or(u32::MAX).min(20);
             let delay = (self.policy.restart_delay_ms << doublings).min(self.policy.restart_delay_max_ms);
@@ -250,34 +199,54 @@ impl Supervisor {
         }
     }
 
-    fn return_home(&mut self, now_ms: u64, actions: &mut Vec<Action>) {
+    fn return_home(&mut self, now_ms: u64, recalled: bool, actions: &mut Vec<Action>) {
         if matches!(self.phase, Phase::Starting { .. } | Phase::Flying) {
-            self.phase = Phase::Returning { since_ms: now_ms };
-            actions.push(Action::CommandStop);
+            self.phase = Phase::Returning { since_ms: now_ms, recalled };
+            actions.push(if recalled { Action::CommandRecall } else { Action::CommandStop });
         }
     }
 
+    /// The user's first Ctrl-C ends the run in order, or says that it is being ended already; the second stops at once.
     fn interrupt(&mut self, now_ms: u64, actions: &mut Vec<Action>) {
+        if self.phase == Phase::Over {
+            return;
+        }
+        self.interrupts += 1;
+        let again = if self.armed {
+            "Ctrl-C again holds the vehicle in place and stops at once"
+        } else {
+            "Ctrl-C again stops at once"
+        };
+        let say = |text: &str| Action::Say(format!("{text}; {again}"));
         match self.phase {
-            Phase::Starting { .. } => {
+            _ if self.interrupts > 1 => self.stop_at_once(now_ms, actions),
+            Phase::Starting { .. } | Phase::Flying if !self.ever_armed => {
                 self.outcome.get_or_insert(Outcome::Failed);
-                actions.push(Action::Say("stopping".to_owned()));
+                actions.push(say("stopping"));
                 self.stop_group(now_ms, 0, false, actions);
             }
-            Phase::Flying => {
-                let advice = "returning, landing and saving; Ctrl-C again holds the vehicle in place and stops at once";
-                actions.push(Action::Say(advice.to_owned()));
-                self.return_home(now_ms, actions);
+            Phase::Starting { .. } | Phase::Flying => {
+                actions.push(say("returning, landing and saving"));
+                self.return_home(now_ms, false, actions);
             }
-            Phase::Returning { .. } => {
-                self.outcome = Some(Outcome::Aborted);
-                actions.push(Action::Say("holding the vehicle where it is and stopping at once".to_owned()));
-                actions.push(Action::VehicleHold);
-                self.stop_group(now_ms, 0, true, actions);
-            }
-            Phase::Stopping { group, .. } => self.stop_group(now_ms, group, true, actions),
+            Phase::Returning { .. } => actions.push(say("the vehicle is returning and landing already")),
+            Phase::Stopping { .. } => actions.push(say("the services are being stopped already")),
             Phase::Over => {}
         }
+    }
+
+    /// Holds a vehicle in the air, and kills everybody.
+    fn stop_at_once(&mut self, now_ms: u64, actions: &mut Vec<Action>) {
+        if self.armed {
+            self.outcome = Some(Outcome::Aborted);
+            actions.push(Action::Say("holding the vehicle where it is and stopping at once".to_owned()));
+            actions.push(Action::VehicleHold);
+        } else {
+            // On the ground the mission is worth what it was worth before.
+            self.outcome.get_or_insert(Outcome::Aborted);
+            actions.push(Action::Say("stopping at once".to_owned()));
+        }
+        self.stop_group(now_ms, 0, true, actions);
     }
 
     /// Stops the groups from `group` on: asks the first that still has processes (kills all of them where `at_once`).
@@ -329,6 +298,11 @@ impl Supervisor {
                 if matches!(record.member, Member::Waiting { until_ms } if now_ms >= until_ms) {
                     record.restarts += 1;
                     self.start(service, actions);
+                    if service == ServiceName::Planner && matches!(self.phase, Phase::Returning { recalled: true, .. })
+                    {
+                        // A recall is in no journal: a planner that was started anew does not know of it.
+                        actions.push(Action::CommandRecall);
+                    }
                 }
             }
         }
@@ -336,7 +310,7 @@ impl Supervisor {
             Phase::Starting { since_ms } if now_ms >= since_ms + self.policy.keeper_timeout_ms => {
                 self.start_the_rest(actions);
             }
-            Phase::Returning { since_ms } if now_ms >= since_ms + self.policy.landing_timeout_ms => {
+            Phase::Returning { since_ms, .. } if now_ms >= since_ms + self.policy.landing_timeout_ms => {
                 self.outcome.get_or_insert(Outcome::NotLanded);
                 actions.push(Action::Say(
                     "the vehicle has not landed in time: stopping; px4-link brings it home".to_owned(),

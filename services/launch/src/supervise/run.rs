@@ -2,6 +2,8 @@
 
 use std::collections::BTreeMap;
 use std::path::Path;
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
 use std::time::{Duration, Instant};
 
 use anyhow::Context as _;
@@ -87,8 +89,9 @@ pub fn run(system: &System, config: &Config, starter: Starter, progress: &mut Pr
         ended_ns: 0,
         outcome: None,
         last_words: None,
-        airborne: false,
+        armed: false,
         track: Track::default(),
+        at_the_end: None,
     };
     run.event(&Event::Begin);
     while run.outcome.is_none() {
@@ -102,7 +105,19 @@ pub fn run(system: &System, config: &Config, starter: Starter, progress: &mut Pr
     if let Err(error) = run.track.append(&Path::new(&config.mission.folder).join("report")) {
         tracing::warn!(%error, "the track could not be written; clearance will not be measured");
     }
-    Ok(run.into_flight(config))
+    let flight = run.into_flight(config);
+    let_signals_end_this_process().context("cannot give the signals back")?;
+    Ok(flight)
+}
+
+/// After the flight, a signal ends this process as any other: what is left to do on the ground (measuring the model) may
+/// take minutes, and `vantage evaluate` does it again. Dropping the handlers alone would leave the signals ignored.
+fn let_signals_end_this_process() -> std::io::Result<()> {
+    let always = Arc::new(AtomicBool::new(true));
+    for signal in [SIGINT, SIGTERM, SIGHUP] {
+        signal_hook::flag::register_conditional_default(signal, Arc::clone(&always))?;
+    }
+    Ok(())
 }
 
 struct Run<'a> {
@@ -117,8 +132,10 @@ struct Run<'a> {
     ended_ns: u64,
     outcome: Option<Outcome>,
     last_words: Option<String>,
-    airborne: bool,
+    armed: bool,
     track: Track,
+    /// Outs of the clock and restarts when the mission was over: what happens while everybody leaves is not its doing.
+    at_the_end: Option<(Option<u32>, BTreeMap<ServiceName, u32>)>,
 }
 
 impl Run<'_> {
@@ -134,10 +151,11 @@ impl Run<'_> {
             self.track.note(truth);
         }
         if let Some(vehicle) = heard.vehicle {
-            if vehicle.armed == 1 {
-                self.airborne = true;
-            } else if core::mem::take(&mut self.airborne) {
-                self.event(&Event::Disarmed);
+            let armed = vehicle.armed == 1;
+            if armed != self.armed {
+                self.armed = armed;
+                self.children.set_in_the_air(armed);
+                self.event(if armed { &Event::Armed } else { &Event::Disarmed });
             }
         }
         for (service, code, how) in self.children.reap() {
@@ -174,6 +192,9 @@ impl Run<'_> {
         self.ended_ns = stamp_ns.max(self.ended_ns);
         let Some(report) = Report::of(state, stamp_ns) else { return };
         self.progress.show(&report);
+        if matches!(report.phase, MissionPhase::Done | MissionPhase::Failed) && self.at_the_end.is_none() {
+            self.at_the_end = Some((self.ports.outs(), self.supervisor.restarts()));
+        }
         match report.phase {
             MissionPhase::Done => self.event(&Event::MissionOver { usable: true }),
             MissionPhase::Failed => self.event(&Event::MissionOver { usable: false }),
@@ -195,6 +216,7 @@ impl Run<'_> {
                 Action::Ask(service) => self.children.ask(service),
                 Action::Kill(service) => self.children.kill(service),
                 Action::CommandStop => warn_if_lost(self.ports.command_mission(MissionCommand::Stop)),
+                Action::CommandRecall => warn_if_lost(self.ports.command_mission(MissionCommand::Recall)),
                 Action::VehicleHold => {
                     warn_if_lost(self.ports.command_vehicle(VehicleCommand::Hold));
                     std::thread::sleep(HOLD_GRACE);
@@ -207,9 +229,8 @@ impl Run<'_> {
 
     fn into_flight(self, config: &Config) -> Flight {
         let lockstep = config.clock.mode == ClockMode::Lockstep;
-        let restarts = self.supervisor.restarts();
-        let deterministic =
-            if lockstep { self.ports.outs().map(|outs| outs == 0 && restarts.is_empty()) } else { Some(false) };
+        let (outs, restarts) = self.at_the_end.unwrap_or_else(|| (self.ports.outs(), self.supervisor.restarts()));
+        let deterministic = if lockstep { outs.map(|outs| outs == 0 && restarts.is_empty()) } else { Some(false) };
         let mission_s =
             self.last.as_ref().map(|state| shared_types::s_from_ns(self.ended_ns.saturating_sub(state.started_ns)));
         Flight {

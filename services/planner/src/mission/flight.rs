@@ -37,7 +37,7 @@ impl Mission {
         }
         match Commander::from_code(vehicle.commander) {
             Some(Commander::Pilot) => return self.suspend(),
-            Some(Commander::Failsafe) if self.ledger.ending.is_some() => return State::Homing,
+            Some(Commander::Failsafe) if self.homeward() => return State::Homing,
             _ => {}
         }
         if self.ledger.ending.is_some_and(|(_, land_here)| land_here) {
@@ -54,7 +54,7 @@ impl Mission {
             return State::Deciding;
         }
         self.ensure_terrain();
-        if self.ledger.ending.is_some() {
+        if self.homeward() {
             return self.go_home(&vehicle);
         }
         if self.ledger.prior.is_none() {
@@ -74,10 +74,10 @@ impl Mission {
 
     fn on_the_ground(&mut self, vehicle: &VehicleState) -> State {
         // Touched down and not disarmed yet: after a restart on the way down nothing but the ending tells.
-        if vehicle.armed == 1 && (self.flown || self.ledger.ending.is_some()) {
+        if vehicle.armed == 1 && (self.flown || self.homeward()) {
             return State::Landing;
         }
-        if self.ledger.ending.is_some() {
+        if self.homeward() {
             return State::Finishing;
         }
         if self.flown {
@@ -313,7 +313,7 @@ impl Mission {
 
     pub(super) fn flying(&mut self, mut flight: Box<Flight>) -> State {
         let Some(vehicle) = self.vehicle else { return State::Flying(flight) };
-        let leaves = self.ledger.ending.is_some() && flight.goal != Goal::Home;
+        let leaves = self.homeward() && flight.goal != Goal::Home;
         if leaves || !Self::under_control(&vehicle) {
             return State::Deciding;
         }
@@ -423,7 +423,7 @@ impl Mission {
                 || vehicle.target_status == TargetStatus::Held.code()
                 || vehicle.mode != FlightMode::Offboard.code()
         });
-        if self.ledger.ending.is_some() || lost {
+        if self.homeward() || lost {
             self.out.effects.push(Effect::CaptureOver(request));
             return State::Deciding;
         }

@@ -93,6 +93,10 @@ pub struct Mission {
     score_sent: Option<u64>,
     progress_ns: u64,
     trainer_failed: bool,
+    /// Told to come home and to leave the mission open. In no journal: `resume` goes on as if it had not been said.
+    recalled: bool,
+    /// Told to end before it began.
+    cancelled: bool,
     published: Option<(MissionState, u64)>,
     sequence: u64,
     out: Outputs,
@@ -140,6 +144,8 @@ impl Mission {
             round_sent: None,
             score_sent: None,
             trainer_failed: false,
+            recalled: false,
+            cancelled: false,
             published: None,
             sequence: 0,
             out: Outputs::default(),
@@ -242,8 +248,14 @@ impl Mission {
         id
     }
 
+    /// Whether no more views are taken and the vehicle is on its way down: the mission ends, or is recalled.
+    fn homeward(&self) -> bool {
+        self.ledger.ending.is_some() || self.recalled
+    }
+
     fn end(&mut self, reason: EndReason) {
-        if self.ledger.ending.is_none() {
+        // A recalled vehicle comes home anyway, and what keeps it from more views now need not do so after `resume`.
+        if self.ledger.ending.is_none() && !self.recalled {
             tracing::info!(reason = %reason, "the mission ends");
             self.record(Record::Ending { reason, land_here: false });
             if let Some(id) = self.score_sent.take() {
@@ -260,8 +272,22 @@ impl Mission {
                 Ok(())
             }
             MissionCommand::Start => Err("the mission of this folder has begun already".to_owned()),
+            MissionCommand::Stop | MissionCommand::Land | MissionCommand::Abort | MissionCommand::Recall
+                if self.ledger.started_ns.is_none() =>
+            {
+                // Nothing has begun and nothing is recorded: the next life of this folder's planner may begin it.
+                tracing::info!(%command, "told to end before the mission began");
+                self.cancelled = true;
+                self.state = State::Over;
+                Ok(())
+            }
             _ if !running => Err(format!("no mission is running: {command} has no meaning")),
+            MissionCommand::Recall => {
+                self.recall();
+                Ok(())
+            }
             MissionCommand::Stop => {
+                self.recalled = false;
                 self.end(EndReason::Operator);
                 if matches!(self.state, State::Suspended(_)) && self.commanded_by_us() {
                     self.state = State::Deciding;
@@ -269,6 +295,7 @@ impl Mission {
                 Ok(())
             }
             MissionCommand::Land => {
+                self.recalled = false;
                 self.record(Record::Ending { reason: EndReason::Operator, land_here: true });
                 self.state = if self.on_ground() { State::Finishing } else { State::Landing };
                 Ok(())
@@ -292,7 +319,18 @@ impl Mission {
         }
     }
 
+    fn recall(&mut self) {
+        tracing::info!("recalled: returning and landing; the mission stays open");
+        self.recalled = true;
+        if self.ledger.suspended && self.commanded_by_us() {
+            // What the operator had held goes home too; held in the journal, it would not go on after that.
+            self.record(Record::GoOn);
+            self.state = State::Deciding;
+        }
+    }
+
     fn start(&mut self) {
+        self.cancelled = false;
         let (mission_id, seed) = (self.setup.mission_id.clone(), self.setup.seed);
         self.record(Record::Started { mission_id, seed });
         self.state = State::Preparing;

@@ -52,7 +52,8 @@ impl Mission {
         let ledger = &self.ledger;
         let config = &self.setup.planner;
         let usable = ledger.over.is_some_and(|(_, usable)| usable);
-        let reason = ledger.over.or(ledger.ending).map_or(EndReason::None, |(reason, _)| reason);
+        let unrecorded = if self.cancelled { EndReason::Operator } else { EndReason::None };
+        let reason = ledger.over.or(ledger.ending).map_or(unrecorded, |(reason, _)| reason);
         let prior = ledger.prior.map(|(prior, _)| prior);
         let count = |length: usize| u32::try_from(length).unwrap_or(u32::MAX);
         MissionState {
@@ -86,7 +87,7 @@ impl Mission {
         if self.ledger.over.is_some() || self.ledger.started_ns.is_none() {
             return 0.0;
         }
-        if self.ledger.ending.is_some() {
+        if self.homeward() {
             return HOME_S;
         }
         let wanted = self.setup.planner.keyframes_wanted() as usize;

@@ -36,7 +36,7 @@ impl Mission {
         let waiting =
             self.ledger.asked.is_some() || (self.ledger.training().is_some() && self.state == State::Deciding);
         let late = self.now_ns > self.progress_ns.saturating_add(ns_from_s(self.setup.planner.service_deadline_s));
-        if waiting && late && self.ledger.ending.is_none() {
+        if waiting && late && !self.homeward() {
             tracing::warn!("training or scoring made no progress");
             self.end(EndReason::ServiceFailed);
             self.progress_ns = self.now_ns;
@@ -137,7 +137,7 @@ impl Mission {
 
     fn choose_batch(&mut self) {
         let Some((prior, limits)) = self.ledger.prior else { return };
-        if self.ledger.ending.is_some() {
+        if self.homeward() {
             return;
         }
         self.ensure_terrain();

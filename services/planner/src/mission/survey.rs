@@ -142,7 +142,7 @@ impl Mission {
 
     pub(super) fn looking(&mut self, step: u32, since_ns: u64, inputs: &Inputs) -> State {
         let config = &self.setup.planner;
-        if self.ledger.ending.is_some() || self.vehicle.is_none_or(|vehicle| !Self::under_control(&vehicle)) {
+        if self.homeward() || self.vehicle.is_none_or(|vehicle| !Self::under_control(&vehicle)) {
             return State::Deciding;
         }
         if let Some(view) = inputs.depths.iter().find(|view| view.stamp_ns >= since_ns) {

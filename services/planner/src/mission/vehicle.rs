@@ -65,7 +65,7 @@ impl Mission {
     pub(super) fn check_ends(&mut self) {
         let Some(vehicle) = self.vehicle else { return };
         let Some((airborne_ns, _)) = self.ledger.airborne else { return };
-        if self.ledger.ending.is_some() || self.ledger.over.is_some() || self.commander() == Some(Commander::Pilot) {
+        if self.homeward() || self.ledger.over.is_some() || self.commander() == Some(Commander::Pilot) {
             return;
         }
         let config = &self.setup.planner;
@@ -103,7 +103,7 @@ impl Mission {
     }
 
     pub(super) fn preparing(&mut self) -> State {
-        if self.ledger.ending.is_some() && self.on_ground() {
+        if self.homeward() && self.on_ground() {
             return State::Finishing;
         }
         let Some(vehicle) = self.vehicle else { return State::Preparing };
@@ -126,7 +126,7 @@ impl Mission {
     pub(super) fn launching(&mut self) -> State {
         let Some(vehicle) = self.vehicle else { return State::Launching };
         let grounded = vehicle.landed == 1;
-        if self.ledger.ending.is_some() && grounded {
+        if self.homeward() && grounded {
             return if vehicle.armed == 1 { State::Landing } else { State::Finishing };
         }
         if !grounded && self.commander() == Some(Commander::Pilot) {
@@ -169,7 +169,11 @@ impl Mission {
 
     pub(super) fn suspended(&mut self, hold: bool) -> State {
         if self.vehicle.is_some() && self.on_ground() {
-            self.end(EndReason::Operator);
+            if self.recalled {
+                self.record(Record::GoOn);
+            } else {
+                self.end(EndReason::Operator);
+            }
             return State::Finishing;
         }
         if hold {
@@ -220,6 +224,10 @@ impl Mission {
     }
 
     pub(super) fn finishing(&mut self) -> State {
+        if self.recalled {
+            tracing::info!("on the ground; the mission is open");
+            return State::Over;
+        }
         if self.ledger.airborne.is_some() && !self.ledger.landed && self.on_ground() {
             self.record(Record::Landed);
         }

@@ -68,6 +68,8 @@ struct Member {
     is_in: bool,
     left: bool,
     held: bool,
+    /// The process of this life has ended.
+    gone: bool,
     outs: u32,
     moved_at_ns: u64,
 }
@@ -137,9 +139,15 @@ impl Lockstep {
         self.members.iter().map(|(&code, m)| (code, m.outs))
     }
 
-    /// Processes to watch: (code, incarnation, pid) of the members that are in.
+    /// Processes to watch: (code, incarnation, pid) of the members that live and have not left, whether in or out.
     pub fn processes(&self) -> impl Iterator<Item = (u32, u64, u32)> + '_ {
-        self.members.iter().filter(|(_, m)| m.seen && !m.left).map(|(&code, m)| (code, m.incarnation, m.pid))
+        self.members.iter().filter(|(_, m)| m.seen && !m.left && !m.gone).map(|(&code, m)| (code, m.incarnation, m.pid))
+    }
+
+    /// Whether the vehicle's link died and has not come back: nobody steers the vehicle, unless a foreign client does.
+    #[must_use]
+    pub fn link_died(&self) -> bool {
+        self.members.get(&self.link).is_some_and(|link| link.gone && !link.left) && !self.foreign
     }
 
     /// Datagrams that never came.
@@ -188,6 +196,11 @@ impl Lockstep {
                 self.datagram_base = read.cast_signed() - grant.datagrams.cast_signed();
             }
         }
+        if member.gone {
+            // Its last words, read after its end was seen: all that they may still tell is that it meant to leave.
+            member.left |= grant.leaving;
+            return;
+        }
         if member.granted != Some(grant.tick) || member.work != grant.work || member.held != grant.held {
             member.moved_at_ns = wall_ns;
         }
@@ -204,8 +217,9 @@ impl Lockstep {
 
     /// A member's process is gone.
     pub fn on_gone(&mut self, service: u32, incarnation: u64) {
-        let Some(member) = self.members.get_mut(&service) else { return };
-        if member.incarnation == incarnation && member.waited_for() {
+        let Some(member) = self.members.get_mut(&service).filter(|m| m.incarnation == incarnation) else { return };
+        member.gone = true;
+        if member.waited_for() {
             member.is_in = false;
             member.outs += 1;
             self.ever_out = true;

@@ -111,6 +111,27 @@ fn a_dead_process_is_out_at_once_and_its_next_life_counts() {
 }
 
 #[test]
+fn a_dead_process_is_not_taken_for_one_that_still_works() {
+    let mut clock = begun(0.0);
+    assert_eq!(clock.processes().count(), 2);
+    // Out by standing still, then dead: gone all the same.
+    clock.on_grant(&grant(PLANNER, 1), 0, MS);
+    assert_eq!(clock.poll(0, 2500 * MS), Phase::Ready, "the link is out");
+    assert!(!clock.link_died());
+    clock.on_gone(LINK, 100);
+    assert_eq!(clock.processes().collect::<Vec<_>>(), [(PLANNER, 100, 1000 + PLANNER)]);
+    assert!(clock.link_died());
+    clock.on_grant(&grant(LINK, 1), 0, 2501 * MS);
+    assert_eq!(clock.members_in(), 1 << PLANNER, "a late word does not bring the dead back");
+    clock.on_grant(&Grant { incarnation: 200, ..grant(LINK, 1) }, 0, 2502 * MS);
+    assert!(!clock.link_died());
+    clock.on_grant(&Grant { incarnation: 200, leaving: true, ..grant(LINK, 1) }, 0, 2503 * MS);
+    clock.on_gone(LINK, 200);
+    assert!(!clock.link_died(), "it left in order");
+    assert_eq!(clock.processes().count(), 1);
+}
+
+#[test]
 fn leaving_is_no_out() {
     let mut clock = begun(0.0);
     clock.on_grant(&grant(LINK, 1), 0, MS);

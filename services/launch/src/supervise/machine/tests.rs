@@ -12,6 +12,13 @@ const POLICY: Policy = Policy {
 };
 
 fn flying() -> Supervisor {
+    let mut supervisor = started();
+    assert!(supervisor.step(30, &Event::Armed).is_empty());
+    supervisor
+}
+
+/// All services run; the motors never did.
+fn started() -> Supervisor {
     let mut supervisor = Supervisor::new(POLICY, &START_ORDER);
     assert_eq!(supervisor.step(0, &Event::Begin), [Action::Start(Keeper)]);
     let started = supervisor.step(10, &Event::Heard(Keeper));
@@ -82,8 +89,13 @@ fn a_service_that_keeps_dying_sends_the_vehicle_home_and_breaks_the_run() {
         now += 1_000;
         supervisor.step(now, &Event::Tick);
     }
-    assert!(last.contains(&Action::CommandStop), "{last:?}");
+    assert!(last.contains(&Action::CommandRecall), "the mission stays open: {last:?}");
+    assert!(!last.contains(&Action::CommandStop), "{last:?}");
     assert!(supervisor.is_ending());
+    // A planner that dies on the way home is told again.
+    supervisor.step(now, &exit(Planner, None));
+    now += 200;
+    assert_eq!(supervisor.step(now, &Event::Tick), [Action::Start(Planner), Action::CommandRecall]);
     let actions = supervisor.step(now + 100, &Event::MissionOver { usable: true });
     let (stopped, outcome) = run_out(&mut supervisor, now + 200, actions);
     assert_eq!(outcome, Outcome::Broken { service: Scorer, code: Some(70), worked: true });
@@ -104,6 +116,61 @@ fn when_the_planner_keeps_dying_the_landed_vehicle_ends_the_run() {
 }
 
 #[test]
+fn before_the_motors_ever_ran_a_service_that_keeps_dying_ends_the_run_at_once() {
+    let mut supervisor = started();
+    let mut actions = Vec::new();
+    for death in 0..=POLICY.crash_limit as u64 {
+        assert!(!actions.contains(&Action::Ask(Planner)), "too early");
+        actions = supervisor.step(1_000 * death, &exit(Trainer, Some(70)));
+        supervisor.step(1_000 * death + 999, &Event::Tick);
+    }
+    assert!(actions.contains(&Action::Ask(Planner)) && !actions.contains(&Action::CommandRecall), "{actions:?}");
+    let (_, outcome) = run_out(&mut supervisor, 5_000, actions);
+    assert_eq!(outcome, Outcome::Broken { service: Trainer, code: Some(70), worked: true });
+}
+
+#[test]
+fn an_interrupt_before_the_motors_ever_ran_stops_in_order_and_is_not_forgotten() {
+    let mut supervisor = started();
+    let actions = supervisor.step(1_000, &Event::Interrupt);
+    assert!(actions.contains(&Action::Ask(Planner)) && !actions.contains(&Action::CommandStop), "{actions:?}");
+    let (stopped, outcome) = run_out(&mut supervisor, 1_000, actions);
+    assert_eq!((stopped.len(), outcome), (START_ORDER.len(), Outcome::Failed));
+}
+
+#[test]
+fn the_users_first_interrupt_on_the_way_home_only_says_what_is_going_on() {
+    let mut supervisor = flying();
+    for death in 0..=POLICY.crash_limit as u64 {
+        supervisor.step(1_000 * death, &exit(Scorer, Some(70)));
+        supervisor.step(1_000 * death + 999, &Event::Tick);
+    }
+    let first = supervisor.step(6_000, &Event::Interrupt);
+    assert!(matches!(first[..], [Action::Say(_)]), "{first:?}");
+    let second = supervisor.step(7_000, &Event::Interrupt);
+    assert!(second.contains(&Action::VehicleHold) && second.contains(&Action::Kill(Px4Link)), "{second:?}");
+    assert_eq!(run_out(&mut supervisor, 7_000, second).1, Outcome::Aborted);
+}
+
+#[test]
+fn while_services_stop_the_second_interrupt_kills_and_holds_what_still_flies() {
+    for flies in [false, true] {
+        let mut supervisor = flying();
+        if !flies {
+            supervisor.step(900, &Event::Disarmed);
+        }
+        supervisor.step(1_000, &Event::MissionOver { usable: true });
+        let first = supervisor.step(1_100, &Event::Interrupt);
+        assert!(matches!(first[..], [Action::Say(_)]), "{first:?}");
+        let second = supervisor.step(1_200, &Event::Interrupt);
+        assert_eq!(second.contains(&Action::VehicleHold), flies, "{second:?}");
+        assert!(second.contains(&Action::Kill(Keeper)));
+        let outcome = run_out(&mut supervisor, 1_200, second).1;
+        assert_eq!(outcome, if flies { Outcome::Aborted } else { Outcome::Done }, "a landed mission is what it was");
+    }
+}
+
+#[test]
 fn a_service_that_refuses_its_configuration_ends_the_run_at_once() {
     for code in [64, 69] {
         let mut supervisor = Supervisor::new(POLICY, &START_ORDER);
@@ -114,6 +181,20 @@ fn a_service_that_refuses_its_configuration_ends_the_run_at_once() {
         assert_eq!(outcome, Outcome::Broken { service: World, code: Some(code), worked: false });
         assert_eq!(stopped.len(), START_ORDER.len() - 1);
     }
+}
+
+#[test]
+fn what_is_missing_before_the_takeoff_is_named_by_its_own_exit_code() {
+    // Members that never came: the simulator had been heard for a minute.
+    let mut supervisor = started();
+    let actions = supervisor.step(60_000, &exit(Simulator, Some(69)));
+    assert!(!actions.iter().any(|action| matches!(action, Action::Kill(_))), "stopped in order: {actions:?}");
+    let (_, outcome) = run_out(&mut supervisor, 60_000, actions);
+    assert_eq!(outcome, Outcome::Broken { service: Simulator, code: Some(69), worked: false });
+    // In flight, a service that lost its bus for an instant is started again.
+    let mut supervisor = flying();
+    assert!(supervisor.step(1_000, &exit(Camera, Some(69))).is_empty());
+    assert_eq!(supervisor.step(1_100, &Event::Tick), [Action::Start(Camera)]);
 }
 
 #[test]
@@ -187,7 +268,7 @@ fn who_does_not_stop_is_killed_but_px4_link_gets_the_time_to_fly_home() {
 proptest::proptest! {
     /// Whatever happens in whatever order, no service runs twice, and a run that is interrupted often enough ends.
     #[test]
-    fn nothing_runs_twice_and_every_run_can_be_ended(script in proptest::collection::vec((0_u8..6, 0_usize..8, 0_u64..800), 0..120)) {
+    fn nothing_runs_twice_and_every_run_can_be_ended(script in proptest::collection::vec((0_u8..7, 0_usize..8, 0_u64..800), 0..120)) {
         let mut supervisor = Supervisor::new(POLICY, &START_ORDER);
         let mut alive: std::collections::BTreeSet<ServiceName> = std::collections::BTreeSet::new();
         let mut over = false;
@@ -200,6 +281,7 @@ proptest::proptest! {
                 2 => Event::Heard(service),
                 3 => Event::Disarmed,
                 4 => Event::Tick,
+                5 => Event::Armed,
                 _ => exit(service, None),
             });
         }
