@@ -33,6 +33,8 @@ pub enum Stage {
     Arm,
     /// Wait until somebody has armed.
     UntilArmed,
+    /// Command to disarm, which the autopilot does on the ground only.
+    Disarm,
     /// Command to take off to a height above the sea, metres.
     Takeoff {
         /// Metres.
@@ -221,7 +223,7 @@ impl Procedure {
             Stage::UntilSlow => view.speed_mps < 0.3 || age_ns > 2_000_000_000,
             Stage::StreamPose => view.streaming && age_ns >= STREAM_FIRST_NS,
             Stage::FlyBack => view.flown_back && age_ns > 0,
-            Stage::UntilDisarmed => !view.armed,
+            Stage::Disarm | Stage::UntilDisarmed => !view.armed,
         }
     }
 
@@ -265,9 +267,9 @@ impl Procedure {
 fn command_of(stage: Stage) -> Option<(MavCmd, [f32; 7])> {
     match stage {
         Stage::Mode { mode, .. } => Some(set_mode(mode)),
-        Stage::Arm => {
+        Stage::Arm | Stage::Disarm => {
             let mut params = NAN7;
-            params[0] = 1.0;
+            params[0] = if stage == Stage::Arm { 1.0 } else { 0.0 };
             Some((MavCmd::MAV_CMD_COMPONENT_ARM_DISARM, params))
         }
         Stage::Takeoff { above_sea_m } => {
@@ -285,6 +287,7 @@ fn stage_name(stage: Stage) -> String {
     match stage {
         Stage::Mode { mode, .. } => format!("the mode {mode}"),
         Stage::Arm => "arming".to_owned(),
+        Stage::Disarm => "disarming".to_owned(),
         Stage::Takeoff { .. } => "the takeoff".to_owned(),
         other => format!("{other:?}"),
     }
@@ -309,7 +312,7 @@ fn give_up(stage: Stage, age_ns: u64) -> Option<String> {
         Stage::StreamPose => (5, "no setpoint can be sent"),
         Stage::FlyBack => (180, "the return path is not flown to its end"),
         Stage::UntilDisarmed => (300, "the vehicle does not land and disarm"),
-        Stage::Mode { .. } | Stage::Arm | Stage::Takeoff { .. } | Stage::UntilSlow => return None,
+        Stage::Mode { .. } | Stage::Arm | Stage::Disarm | Stage::Takeoff { .. } | Stage::UntilSlow => return None,
     };
     (age_ns > limit_s * shared_types::NS_PER_S).then(|| reason.to_owned())
 }

@@ -32,7 +32,7 @@ impl Core {
                     let arming =
                         self.running.as_ref().is_some_and(|running| running.procedure.command == VehicleCommand::Arm);
                     self.commander = if arming { Commander::Vantage } else { Commander::Pilot };
-                    self.expected = mode;
+                    self.settle(mode);
                 }
                 Commander::Vantage => self.see_modes(now_ns, mode, intended),
                 Commander::Failsafe if mode == FlightMode::Pilot => self.commander = Commander::Pilot,
@@ -45,6 +45,16 @@ impl Core {
                 }
                 Commander::Failsafe | Commander::Pilot => {}
             }
+        }
+        let flown = match self.commander {
+            Commander::Vantage => self.flown || self.telemetry.in_air(),
+            Commander::Pilot => false,
+            Commander::Nobody => self.flown && self.telemetry.mode != FlightMode::Hold,
+            Commander::Failsafe => self.flown,
+        };
+        if flown != self.flown {
+            self.flown = flown;
+            self.remember();
         }
         if self.commander != before {
             tracing::info!(commander = %self.commander, %mode, failsafe = %self.failsafe, "who commands changed");
@@ -60,7 +70,8 @@ impl Core {
     }
 
     pub(super) fn see_first(&mut self, now_ns: u64, mode: FlightMode, intended: FlightMode) {
-        let found = found_in_air(mode, intended, self.telemetry.charge, self.outside_fence(), self.kept.ours);
+        let found =
+            found_in_air(mode, intended, self.telemetry.charge, self.outside_fence(), self.kept.commanded(mode));
         tracing::info!(?found, %mode, %intended, "found the vehicle armed");
         match found {
             Found::Recover => {
@@ -69,7 +80,7 @@ impl Core {
             }
             Found::Ours => {
                 self.commander = Commander::Vantage;
-                self.expected = mode;
+                self.settle(mode);
             }
             Found::LeaveTo(commander) => {
                 self.commander = commander;
@@ -83,8 +94,7 @@ impl Core {
     pub(super) fn recover(&mut self, now_ns: u64) {
         self.drop_running("setpoints were interrupted");
         self.out.orders.push(Order::Off);
-        self.expect(now_ns, FlightMode::Hold);
-        self.before_expected = self.telemetry.mode;
+        self.expect_from(now_ns, FlightMode::Hold, self.telemetry.mode);
         let stages = [
             Stage::Mode { mode: FlightMode::Hold, always: true },
             Stage::UntilSlow,
@@ -113,17 +123,35 @@ impl Core {
     }
 
     pub(super) fn see_modes(&mut self, now_ns: u64, mode: FlightMode, intended: FlightMode) {
-        if self.expected == FlightMode::Takeoff && mode == FlightMode::Hold {
-            self.expect(now_ns, FlightMode::Hold);
+        let changing = now_ns.saturating_sub(self.expected_since_ns) < MODE_GRACE_NS;
+        // Somebody flies it by hand, whatever was asked for; until our own word to go on is obeyed, it still may.
+        let leaving_the_pilot = changing && self.before_expected == FlightMode::Pilot;
+        if mode == FlightMode::Pilot && self.telemetry.landed != Some(true) && !leaving_the_pilot {
+            self.commander = Commander::Pilot;
+            return;
+        }
+        // A takeoff ends in Hold, and so does one that a failsafe stopped.
+        let chosen = matches!(intended, FlightMode::Hold | FlightMode::Unknown) && !self.telemetry.critical;
+        if self.expected == FlightMode::Takeoff && mode == FlightMode::Hold && chosen && !self.takeoff_unseen() {
+            self.settle(FlightMode::Hold);
+            self.remember();
         }
         // Down by our command: what mode the autopilot goes back to before it disarms is nobody's choice.
         if self.telemetry.landed == Some(true) && matches!(self.expected, FlightMode::Land | FlightMode::Return) {
             return;
         }
-        let changing = now_ns.saturating_sub(self.expected_since_ns) < MODE_GRACE_NS;
-        if mode == self.expected || (changing && mode == self.before_expected) || self.expected == FlightMode::Unknown {
+        // Our own Hold and a failsafe's look the same but for this.
+        let forced = mode == FlightMode::Hold && self.telemetry.critical && !changing;
+        let as_told =
+            mode == self.expected || (changing && mode == self.before_expected) || self.expected == FlightMode::Unknown;
+        if as_told && !forced {
             if mode == self.expected {
                 self.failsafe = FailsafeReason::None;
+                // The grace is for the change that is not yet seen: from now on the mode before is somebody's choice.
+                if self.before_expected != mode {
+                    self.settle(mode);
+                    self.remember();
+                }
             }
             if self.report.is_some_and(|report| report.stalled) && mode == FlightMode::Offboard {
                 tracing::warn!("no setpoint for more than 0.5 s: taking control anew");
@@ -152,12 +180,32 @@ impl Core {
         self.commander = Commander::Failsafe;
     }
 
+    /// A mode is about to be commanded. On disk before it is sent: a px4-link that dies now must know it for its own.
     pub(super) fn expect(&mut self, now_ns: u64, mode: FlightMode) {
-        if self.expected != mode {
-            self.before_expected = self.expected;
-        }
+        let before = if self.expected == mode { self.before_expected } else { self.expected };
+        self.expect_from(now_ns, mode, before);
+    }
+
+    /// As [`Self::expect`], where the mode before was not one of ours.
+    pub(super) fn expect_from(&mut self, now_ns: u64, mode: FlightMode, before: FlightMode) {
+        let changed = (self.expected, self.before_expected) != (mode, before);
+        self.before_expected = before;
         self.expected = mode;
         self.expected_since_ns = now_ns;
+        if changed {
+            self.remember();
+        }
+    }
+
+    /// The vehicle is in a mode, and no change of ours is under way.
+    fn settle(&mut self, mode: FlightMode) {
+        self.expected = mode;
+        self.before_expected = mode;
+    }
+
+    /// Whether the takeoff was commanded out of Hold and not yet seen.
+    fn takeoff_unseen(&self) -> bool {
+        self.before_expected == FlightMode::Hold && self.telemetry.landed == Some(true)
     }
 
     pub(super) fn outside_fence(&self) -> bool {
@@ -169,11 +217,14 @@ impl Core {
     }
 
     pub(super) fn remember(&mut self) {
-        let kept = Kept {
-            transform: self.world.kept(),
-            ours: self.commander == Commander::Vantage,
-            last_target_id: self.kept.last_target_id,
-        };
+        let mut kept = Kept { transform: self.world.kept(), ..self.kept.clone() };
+        // Before the vehicle was looked at, what an earlier life knew of the flight still counts.
+        if !self.first_sight {
+            kept.ours = self.commander == Commander::Vantage;
+            kept.expected = self.expected;
+            kept.before_expected = self.before_expected;
+            kept.flown = self.flown;
+        }
         self.store.keep(&kept);
         self.kept = kept;
     }

@@ -12,11 +12,20 @@ use crate::stream::Order;
 impl Core {
     /// Asked to end. True when that must wait until the vehicle has landed.
     pub fn stop(&mut self, now_ns: u64) -> bool {
-        if !self.flies_for_us() {
+        if !self.telemetry.armed || self.commander != Commander::Vantage {
             return false;
         }
         self.leaving = true;
-        self.go_home(now_ns, None);
+        if self.first_sight {
+            // Away until just now: what is seen of the vehicle is old. Whatever is found goes on home.
+            self.landing = true;
+        } else if !self.landing && self.telemetry.in_air() {
+            self.go_home(now_ns, None);
+        } else if !self.landing {
+            self.drop_running("px4-link was told to end");
+            let disarm = Procedure::new(VehicleCommand::Land, &[Stage::Disarm]);
+            self.running = Some(Running { procedure: disarm, address: None });
+        }
         true
     }
 
@@ -63,6 +72,15 @@ impl Core {
 
     /// A planner that is silent for too long ends the flight.
     pub(super) fn mind_the_planner(&mut self, now_ns: u64) {
+        // After an absence nothing is decided before the vehicle was looked at.
+        if self.first_sight {
+            return;
+        }
+        let lifted = self.running.as_ref().is_some_and(|running| running.procedure.stage() == Some(Stage::Disarm));
+        if lifted && self.flies_for_us() {
+            tracing::warn!("off the ground before it could be disarmed: returning and landing");
+            self.go_home(now_ns, None);
+        }
         let since_ns = self.alive_ns.max(self.started_ns.unwrap_or(now_ns));
         let silent_s = shared_types::s_from_ns(now_ns.saturating_sub(since_ns));
         if silent_s > self.config.planner_return_s && self.flies_for_us() && !self.landing {
@@ -78,10 +96,9 @@ impl Core {
 
     /// After a landing the autopilot goes back to the mode flown before, often OFFBOARD, in which it is never ready to arm.
     pub(super) fn hold_on_ground(&mut self, now_ns: u64) {
-        let stuck = matches!(
-            self.telemetry.mode,
-            FlightMode::Offboard | FlightMode::Takeoff | FlightMode::Land | FlightMode::Return | FlightMode::Other
-        );
+        // Only after a flight of ours: a pilot who chooses a mode on the ground is left alone.
+        let stuck =
+            self.flown && matches!(self.telemetry.mode, FlightMode::Offboard | FlightMode::Takeoff | FlightMode::Land);
         let idle = self.running.is_none() && self.report.is_none_or(|report| !report.streaming);
         if self.phase == Phase::Ground && stuck && idle && now_ns >= self.ground_hold_due_ns {
             self.ground_hold_due_ns = now_ns + 2 * shared_types::NS_PER_S;

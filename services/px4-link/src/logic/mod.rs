@@ -89,6 +89,8 @@ pub struct Core {
     report: Option<Report>,
     landing: bool,
     leaving: bool,
+    /// A flight of ours was not yet followed by Hold on the ground.
+    flown: bool,
     heartbeat_due_ns: u64,
     timesync_due_ns: u64,
     timesync_sent_ns: Option<u64>,
@@ -108,7 +110,6 @@ impl Core {
             incarnation,
             world: WorldTransform::new(kept.transform),
             store,
-            kept,
             way_back,
             telemetry: Telemetry::default(),
             sync: TimeSync::new(lockstep),
@@ -133,11 +134,13 @@ impl Core {
             report: None,
             landing: false,
             leaving: false,
+            flown: kept.flown,
             heartbeat_due_ns: 0,
             timesync_due_ns: 0,
             timesync_sent_ns: None,
             ground_hold_due_ns: 0,
             out: Outputs::default(),
+            kept,
         }
     }
 

@@ -35,6 +35,8 @@ impl Core {
             return;
         }
         self.kept.last_target_id = header.id;
+        // On disk whatever becomes of it: a target that was refused once is not flown by the next life.
+        self.remember();
         let (low, high) = (DVec3::from_array(header.volume_min_m), DVec3::from_array(header.volume_max_m));
         let fits = |w: &Waypoint| {
             let at = DVec3::from_array(w.position_m);
@@ -60,7 +62,6 @@ impl Core {
         self.refused = None;
         self.way_back = WayBack::of(waypoints);
         self.store.keep_way_back(&self.way_back);
-        self.remember();
         let plan = Box::new(plan(&Path::new(report.input, path, &self.limits), &self.limits));
         tracing::info!(id = header.id, duration_s = plan.duration_s, "flying a target");
         self.out.orders.push(Order::Fly { id: header.id, plan, needs_planner: true });
@@ -98,7 +99,9 @@ impl Core {
                     params::refusal(&self.params, self.telemetry.remote_control, self.config.allow_unsafe_offboard_loss)
                 })
                 .flatten();
-        let objection = self.phase.objection(command).map(str::to_owned).or(unsafe_to_fly).or_else(|| {
+        let objection =
+            self.phase.objection(command).or_else(|| self.objection_while_ending(command)).map(str::to_owned);
+        let objection = objection.or(unsafe_to_fly).or_else(|| {
             let blind = command == VehicleCommand::TakeControl && !self.telemetry.ready(now_ns);
             let no_home = command == VehicleCommand::Takeoff && self.telemetry.home.is_none();
             let wild = command == VehicleCommand::Takeoff && !(0.5..=120.0).contains(&request.altitude_m);
@@ -115,6 +118,15 @@ impl Core {
         self.begin(now_ns, command, request.altitude_m, Some(address));
     }
 
+    /// Why a command cannot be taken on the way down.
+    fn objection_while_ending(&self, command: VehicleCommand) -> Option<&'static str> {
+        use VehicleCommand::{Hold, Land, Return, TakeControl};
+        if self.leaving && !matches!(command, Hold | Return | Land) {
+            return Some("px4-link was told to end; it takes hold, return and land");
+        }
+        (self.landing && command == TakeControl).then_some("the vehicle returns or lands; command hold first")
+    }
+
     /// Starts a command; the one at work is superseded.
     pub(super) fn begin(
         &mut self,
@@ -125,7 +137,9 @@ impl Core {
     ) {
         self.drop_running(&format!("superseded by {command}"));
         self.landing = matches!(command, VehicleCommand::Return | VehicleCommand::Land);
-        let mode = |mode| Stage::Mode { mode, always: false };
+        // While a change that was commanded is not yet seen, the mode that is seen proves nothing.
+        let unseen = self.before_expected != self.expected;
+        let mode = |mode| Stage::Mode { mode, always: unseen && mode != FlightMode::Offboard };
         let on_ground = !self.telemetry.armed;
         let in_control =
             self.telemetry.mode == FlightMode::Offboard && self.report.is_some_and(|report| report.streaming);
@@ -149,8 +163,7 @@ impl Core {
             VehicleCommand::GoOn => {
                 self.commander = Commander::Vantage;
                 self.failsafe = FailsafeReason::None;
-                self.expect(now_ns, FlightMode::Hold);
-                self.before_expected = self.telemetry.mode;
+                self.expect_from(now_ns, FlightMode::Hold, self.telemetry.mode);
                 vec![Stage::Mode { mode: FlightMode::Hold, always: true }]
             }
         };
