@@ -57,7 +57,9 @@ pub struct Kept {
     pub before_expected: FlightMode,
     /// A flight of ours was not yet followed by Hold on the ground.
     pub flown: bool,
-    /// Ids up to this one were seen as targets.
+    /// The mission of the last target: ids count within a mission.
+    pub mission: u64,
+    /// Ids up to this one were seen as targets of that mission.
     pub last_target_id: u64,
 }
 
@@ -69,6 +71,7 @@ impl Default for Kept {
             expected: FlightMode::Unknown,
             before_expected: FlightMode::Unknown,
             flown: false,
+            mission: 0,
             last_target_id: 0,
         }
     }

@@ -27,7 +27,14 @@ impl Core {
     pub fn on_target(&mut self, header: &VehicleTarget, waypoints: &[Waypoint]) {
         let Some(report) = self.report.filter(|_| self.phase == Phase::Offboard && !self.landing) else { return };
         let (path_len, return_len) = (header.path_len as usize, header.return_len as usize);
-        if header.id == report.target_id || self.refused.is_some_and(|(id, _)| id == header.id) {
+        let known = header.mission == self.kept.mission;
+        if !known {
+            // Another mission counts its targets anew.
+            self.kept.mission = header.mission;
+            self.kept.last_target_id = 0;
+            self.refused = None;
+        }
+        if known && (header.id == report.target_id || self.refused.is_some_and(|(id, _)| id == header.id)) {
             return;
         }
         if header.id <= self.kept.last_target_id {

@@ -83,7 +83,14 @@ fn wrong_targets_are_refused_by_name() {
     assert_eq!(refused(&rig), (6, Some(TargetStatus::RefusedPath)));
     rig.target(7, &[at(f64::NAN, 0.0, 2.0, 0.0, 0.0)]);
     assert_eq!(refused(&rig), (7, Some(TargetStatus::RefusedPath)));
-    let far = VehicleTarget { id: 8, volume_min_m: [-20.0; 3], volume_max_m: [20.0; 3], path_len: 1, return_len: 0 };
+    let far = VehicleTarget {
+        id: 8,
+        mission: 1,
+        volume_min_m: [-20.0; 3],
+        volume_max_m: [20.0; 3],
+        path_len: 1,
+        return_len: 0,
+    };
     rig.core.on_target(&far, &[at(1.5, 0.0, 2.5, 0.0, 0.0)]);
     assert_eq!(refused(&rig), (8, Some(TargetStatus::RefusedStart)));
     rig.seconds(4);
@@ -92,6 +99,10 @@ fn wrong_targets_are_refused_by_name() {
     assert!(before.distance(rig.simulator.truth().position_m) < 0.05);
     rig.target(9, &[at(0.0, 0.0, 2.5, 0.0, 0.0)]);
     assert_eq!(refused(&rig), (9, Some(TargetStatus::Flying)));
+    // The next mission in the same system counts from 1.
+    rig.mission = 2;
+    rig.target(1, &[at(0.5, 0.0, 2.5, 0.0, 0.0)]);
+    assert_eq!(refused(&rig), (1, Some(TargetStatus::Flying)));
 }
 
 #[test]

@@ -30,6 +30,9 @@ pub struct Rig {
     pub now_ns: u64,
     pub planner: bool,
     pub requests: u64,
+    pub mission: u64,
+    /// Nothing passes between px4-link and the autopilot.
+    pub deaf: bool,
     pub replies: BTreeMap<u64, CommandReply>,
     pub path: Vec<DVec3>,
 }
@@ -47,6 +50,8 @@ impl Rig {
             now_ns: 0,
             planner: true,
             requests: 0,
+            mission: 1,
+            deaf: false,
             replies: BTreeMap::new(),
             path: Vec::new(),
         }
@@ -64,8 +69,10 @@ impl Rig {
         if !with_link {
             return;
         }
-        for received in
-            datagrams.iter().filter(|(link, _)| *link == LinkId::Onboard).flat_map(|(_, bytes)| decode(bytes))
+        for received in datagrams
+            .iter()
+            .filter(|(link, _)| *link == LinkId::Onboard && !self.deaf)
+            .flat_map(|(_, bytes)| decode(bytes))
         {
             self.core.on_message(self.now_ns, &received);
         }
@@ -78,6 +85,9 @@ impl Rig {
         outputs.orders.into_iter().for_each(|order| self.streamer.order(order));
         if let Some(to_send) = self.streamer.step(self.now_ns) {
             self.pending.push(encode(1, 0, &setpoint_message(1, self.now_ns, &to_send)));
+        }
+        if self.deaf {
+            self.pending.clear();
         }
         self.core.on_report(self.streamer.report());
         self.replies.extend(outputs.replies.iter().map(|(to, reply)| (to.request_id, *reply)));
@@ -150,6 +160,7 @@ impl Rig {
         all.extend(back);
         let header = VehicleTarget {
             id,
+            mission: self.mission,
             volume_min_m: [-20.0, -20.0, 0.3],
             volume_max_m: [20.0, 20.0, 12.0],
             path_len,
