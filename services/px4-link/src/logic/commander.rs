@@ -2,7 +2,7 @@
 
 use shared_types::messages::{ChargeState, Commander, FailsafeReason, FlightMode, VehicleCommand};
 
-use super::{Core, MODE_GRACE_NS, Running};
+use super::{Core, INTENT_PATIENCE_NS, MODE_GRACE_NS, QUIET_NS, Running};
 use crate::commands::{Procedure, Stage};
 use crate::state::{Found, found_in_air};
 use crate::store::{Kept, WayBack};
@@ -13,6 +13,9 @@ impl Core {
     pub(super) fn see_commander(&mut self, now_ns: u64) {
         let before = self.commander;
         let (mode, intended) = (self.telemetry.mode, self.telemetry.intended);
+        if self.deaf(now_ns) || (self.first_sight && mode == FlightMode::Unknown) {
+            return;
+        }
         if !self.telemetry.armed {
             self.commander = Commander::Nobody;
             self.failsafe = FailsafeReason::None;
@@ -21,7 +24,12 @@ impl Core {
                 self.out.orders.push(Order::Off);
             }
         } else if self.first_sight {
-            if mode == FlightMode::Unknown || !self.asks.done() || !self.telemetry.ready(now_ns) {
+            if !self.asks.done() || !self.telemetry.ready(now_ns) {
+                return;
+            }
+            // What was intended tells a failsafe's Hold from an operator's; some autopilots never say.
+            let since_ns = *self.sight_since_ns.get_or_insert(now_ns);
+            if intended == FlightMode::Unknown && now_ns.saturating_sub(since_ns) < INTENT_PATIENCE_NS {
                 return;
             }
             self.first_sight = false;
@@ -69,9 +77,23 @@ impl Core {
         }
     }
 
+    /// In the air, what is known of the vehicle is too old to decide or to command by.
+    pub(super) fn deaf(&self, now_ns: u64) -> bool {
+        let silent = now_ns.saturating_sub(self.telemetry.heard_ns) > QUIET_NS;
+        self.telemetry.armed && (silent || self.telemetry.mode == FlightMode::Unknown)
+    }
+
     pub(super) fn see_first(&mut self, now_ns: u64, mode: FlightMode, intended: FlightMode) {
-        let found =
-            found_in_air(mode, intended, self.telemetry.charge, self.outside_fence(), self.kept.commanded(mode));
+        let found = if self.world.moved_unexplained() {
+            // Where the object is now nobody knows: no setpoint in this frame until the operator's word.
+            tracing::error!(
+                "the estimator was reset while px4-link was away, and its origin does not tell by how much"
+            );
+            Found::LeaveTo(Commander::Failsafe)
+        } else {
+            found_in_air(mode, intended, self.telemetry.charge, self.outside_fence(), self.kept.commanded(mode))
+        };
+        self.world.accept();
         tracing::info!(?found, %mode, %intended, "found the vehicle armed");
         match found {
             Found::Recover => {

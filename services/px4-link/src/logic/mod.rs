@@ -33,6 +33,12 @@ const START_TOLERANCE_M: f64 = 0.3;
 /// The stored way back is flown from no farther away than this, metres.
 const WAY_TOLERANCE_M: f64 = 1.5;
 const MOST_WAYPOINTS: usize = 1024;
+/// Silence of the autopilot in which nothing is decided or commanded, nanoseconds.
+const QUIET_NS: u64 = 500_000_000;
+/// Silence of the autopilot after which its modes must be heard again, nanoseconds.
+const DEAF_NS: u64 = 900_000_000;
+/// How long an armed vehicle is looked at before it is decided without CURRENT_MODE, nanoseconds.
+const INTENT_PATIENCE_NS: u64 = 2_000_000_000;
 /// How long after a command the mode may still be the one before, nanoseconds.
 const MODE_GRACE_NS: u64 = 4_000_000_000;
 const ANSWERS_KEPT: usize = 128;
@@ -81,6 +87,10 @@ pub struct Core {
     expected_since_ns: u64,
     /// The next sight of an armed vehicle is as after a start.
     first_sight: bool,
+    /// Since when an armed vehicle could be looked at but for its intended mode.
+    sight_since_ns: Option<u64>,
+    /// Since when everything that was asked is answered.
+    synced_ns: Option<u64>,
     running: Option<Running>,
     answered: VecDeque<(ReplyAddress, CommandReply)>,
     started_ns: Option<u64>,
@@ -126,6 +136,8 @@ impl Core {
             before_expected: FlightMode::Unknown,
             expected_since_ns: 0,
             first_sight: true,
+            sight_since_ns: None,
+            synced_ns: None,
             running: None,
             answered: VecDeque::new(),
             started_ns: None,
@@ -164,6 +176,11 @@ impl Core {
 
     /// Takes a message of the pinned autopilot's system.
     pub fn on_message(&mut self, now_ns: u64, received: &Received) {
+        let heard_ns = self.telemetry.heard_ns;
+        if heard_ns != 0 && now_ns.saturating_sub(heard_ns) > DEAF_NS {
+            // After a silence nothing is decided by the modes of before.
+            self.telemetry.forget_modes();
+        }
         if self.system.is_none() {
             self.system = Some(received.system);
             self.asks = Asks::all();
@@ -222,7 +239,11 @@ impl Core {
             self.reboots = self.telemetry.reboots;
             tracing::warn!("the autopilot was started again; asking anew");
             self.asks = Asks::all();
+            self.advised = false;
             self.first_sight = true;
+            self.sight_since_ns = None;
+            self.synced_ns = None;
+            self.world.forget_last();
         }
     }
 
@@ -240,8 +261,13 @@ impl Core {
     /// This process was away: look at the state as after a restart.
     pub fn rejoin(&mut self, now_ns: u64) {
         self.first_sight = true;
+        self.sight_since_ns = None;
         self.started_ns = Some(now_ns);
+        self.telemetry.forget_modes();
         self.world.forget_last();
+        if self.system.is_some() {
+            self.asks.push(Ask::origin());
+        }
         self.drop_running("px4-link was stopped for a while");
         self.out.orders.push(Order::Off);
     }
@@ -255,6 +281,7 @@ impl Core {
                 self.out.messages.push(message);
             }
             self.check_params();
+            self.ask_for_gimbal(now_ns, system);
         }
         self.see_commander(now_ns);
         self.phase = self.phase.next(&Facts {
@@ -268,13 +295,16 @@ impl Core {
             commander: self.commander,
         });
         self.hold_on_ground(now_ns);
-        self.mind_the_planner(now_ns);
-        self.run_procedure(now_ns);
+        if !self.deaf(now_ns) {
+            self.mind_the_planner(now_ns);
+            self.run_procedure(now_ns);
+        }
         if self.telemetry.position_stamp_ns > 0 {
             self.out.orders.push(Order::Measured {
                 position_m: self.telemetry.position_m,
                 speed_mps: self.telemetry.velocity_mps.length(),
                 offset_m: self.world.offset_m(),
+                heard_ns: self.telemetry.heard_ns,
             });
         }
         self.point_gimbal(now_ns);
@@ -297,10 +327,24 @@ impl Core {
                 }
             }
         }
-        if !self.config.is_local() {
-            for line in params::advice(&self.params, self.config.speed_mps) {
+        if !self.telemetry.is_our_simulator() {
+            for line in params::advice(&self.params, self.telemetry.remote_control, self.config.speed_mps) {
                 tracing::warn!("{line}");
             }
+        }
+    }
+
+    /// A gimbal may start after the autopilot: on the ground it is asked for again and again.
+    fn ask_for_gimbal(&mut self, now_ns: u64, system: u8) {
+        if !self.asks.done() {
+            return;
+        }
+        let synced_ns = *self.synced_ns.get_or_insert(now_ns);
+        if self.gimbal.present() || self.telemetry.armed {
+            return;
+        }
+        if let Some((command, params)) = self.gimbal.ask(now_ns, synced_ns) {
+            self.out.messages.push(command_long(system, command, params, 0));
         }
     }
 

@@ -5,6 +5,7 @@ use shared_types::messages::{TargetStatus, VehicleState};
 
 use super::Core;
 use crate::frames::{wrap_pi, yaw_of};
+use crate::gimbal::NO_GIMBAL;
 use crate::params;
 use crate::path::Point;
 
@@ -59,7 +60,9 @@ impl Core {
             target_status: status.code(),
             reset_count: self.world.reset_count(),
             ready: u32::from(
-                t.ready(now_ns) && self.asks.done() && (self.gimbal.present() || self.gimbal.absent(t.heartbeats)),
+                t.ready(now_ns)
+                    && self.asks.done()
+                    && (self.gimbal.present() || self.gimbal.absent(now_ns, self.synced_ns)),
             ),
             armable: u32::from(t.armable),
             gimbal_present: u32::from(self.gimbal.present()),
@@ -91,6 +94,10 @@ impl Core {
         if age_s > 3.0 {
             return Some(format!("nothing heard of the autopilot for {age_s:.1} s"));
         }
-        params::refusal(&self.params, self.telemetry.remote_control, self.config.allow_unsafe_offboard_loss)
+        let unsafe_to_fly =
+            params::refusal(&self.params, self.telemetry.remote_control, self.config.allow_unsafe_offboard_loss);
+        unsafe_to_fly
+            .filter(|_| self.asks.done())
+            .or_else(|| self.gimbal.absent(now_ns, self.synced_ns).then(|| NO_GIMBAL.to_owned()))
     }
 }

@@ -4,6 +4,7 @@
 
 mod hands;
 mod rig;
+mod silence;
 
 use glam::DVec3;
 use px4_link::commands::set_mode;
