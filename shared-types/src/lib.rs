@@ -7,7 +7,8 @@
 //! - [`system`]: one vehicle and its services: folders, shared-memory prefix;
 //! - [`frames`]: poses and the pinhole camera;
 //! - [`config`]: the configuration file;
-//! - [`folder`]: the mission folder, and files that appear whole.
+//! - [`folder`]: the mission folder, and files that appear whole;
+//! - [`realtime`]: what a thread with a deadline asks of the kernel.
 
 pub mod bus;
 pub mod channel;
@@ -17,6 +18,7 @@ pub mod frames;
 pub mod logging;
 pub mod messages;
 pub mod payload;
+pub mod realtime;
 pub mod service;
 pub mod system;
 

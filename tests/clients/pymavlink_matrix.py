@@ -5,7 +5,8 @@
     ./pymavlink_matrix.py [udpin:127.0.0.1:14540]
 
 Checks: the acknowledgement matrix, streams, parameters, TIMESYNC, gimbal control and its denial, OFFBOARD's rules on the
-ground and in the air, loss of setpoints and their return, Hold against a resumed stream, battery thresholds. The vehicle
+ground and in the air, loss of setpoints and their return, Hold against a resumed stream, loss of the ground station, the
+default return on lost setpoints, takeoff in OFFBOARD, battery thresholds and their floor. The vehicle
 must stand on the ground at the start, freshly booted. Each line printed is 'ok CHECK detail' or 'FAILED CHECK reason';
 the last line is 'N passed, N failed'.
 """
@@ -21,7 +22,7 @@ from pymavlink import mavutil  # noqa: E402  (the variable above decides the pro
 URL = next((a for a in sys.argv[1:] if ":" in a), "udpin:127.0.0.1:14540")
 NAN = float("nan")
 ACCEPTED, REJECTED, DENIED, UNSUPPORTED = 0, 1, 2, 3
-HOLD, RETURN, LAND, OFFBOARD = (4, 3), (4, 5), (4, 6), (6, 0)
+HOLD, RETURN, LAND, OFFBOARD, TAKEOFF, MISSION = (4, 3), (4, 5), (4, 6), (6, 0), (4, 2), (4, 4)
 passed, failed = 0, 0
 
 
@@ -32,6 +33,8 @@ class Client:
         self.link = mavutil.mavlink_connection(URL, source_system=245, source_component=190)
         self.latest, self.count, self.texts = {}, {}, []
         self.setpoint, self.sent_at, self.beat_at = None, 0.0, 0.0
+        self.mask, self.frame, self.target = 0x9F8, 1, 1
+        self.slowest_ack_s = 0.0
 
     def turn(self):
         """Sends what is due and reads one message."""
@@ -42,7 +45,7 @@ class Client:
         if self.setpoint is not None and now - self.sent_at > 0.05:
             x, y, z, yaw = self.setpoint
             self.link.mav.set_position_target_local_ned_send(
-                0, 1, 1, 1, 0x9F8, x, y, z, 0, 0, 0, 0, 0, 0, yaw, 0)
+                0, self.target, 1, self.frame, self.mask, x, y, z, 0, 0, 0, 0, 0, 0, yaw, 0)
             self.sent_at = now
         message = self.link.recv_match(blocking=True, timeout=0.01)
         if message is not None and message.get_srcComponent() == 1:
@@ -80,10 +83,12 @@ class Client:
         mav.srcComponent = source or own
         mav.command_long_send(system, component, number, 0, *params)
         mav.srcComponent = own
-        end = time.monotonic() + 0.7
+        sent = time.monotonic()
+        end = sent + 0.7
         while time.monotonic() < end:
             message = self.turn()
             if message is not None and message.get_type() == "COMMAND_ACK" and message.command == number:
+                self.slowest_ack_s = max(self.slowest_ack_s, time.monotonic() - sent)
                 return message.result
         return None
 
@@ -248,6 +253,42 @@ def gimbal_message():
     assert abs(pitch + 25) < 1, pitch
 
 
+def gimbal_set_pitchyaw_is_ignored():
+    """Message 287 has no handler in PX4: no answer and no motion."""
+    before = c.next("GIMBAL_DEVICE_ATTITUDE_STATUS").q
+    for _ in range(10):
+        c.link.mav.gimbal_manager_set_pitchyaw_send(1, 1, 12, 0, math.radians(-60), 0, NAN, NAN)
+        c.run(0.1)
+    after = c.next("GIMBAL_DEVICE_ATTITUDE_STATUS").q
+    assert max(abs(a - b) for a, b in zip(before, after)) < 0.02, (before, after)
+
+
+def no_texts_without_a_ground_station():
+    """STATUSTEXT goes only where a ground station's heartbeat was heard."""
+    c.beat_at = time.monotonic() + 14
+    c.run(12)
+    c.texts.clear()
+    equal(c.set_mode((3, 0)), ACCEPTED)
+    equal(c.command(400, [1]), REJECTED)
+    c.run(1)
+    equal(c.texts, [])
+    c.beat_at = 0.0
+    c.run(0.5)
+    equal(c.command(400, [1]), REJECTED)
+    c.until(lambda: any("Arming denied" in t for t in c.texts), 2, "the text with a ground station")
+    equal(c.set_mode(HOLD), ACCEPTED)
+    c.until(c.can_arm, 5, "PREARM_CHECK in Hold")
+
+
+def unused_parameters():
+    """Non-zero values where a command takes none are denied before anything else is looked at."""
+    equal(c.command(21, [0, 0, 5]), DENIED)
+    equal(c.command(22, [NAN, 5]), DENIED)
+    equal(c.command(22, [NAN, NAN, 5]), DENIED)
+    equal(c.command(176, [1, 4, 3, 5]), DENIED)
+    equal(c.command(176, [1, 4, 3, 0, 0, 0, 5]), DENIED)
+
+
 def offboard_without_stream_on_ground():
     equal(c.set_mode(OFFBOARD), ACCEPTED)
     c.wait_mode(OFFBOARD)
@@ -282,6 +323,75 @@ def offboard_at_the_first_setpoint():
     equal(c.set_mode(OFFBOARD), ACCEPTED)
     c.wait_mode(OFFBOARD)
     c.until(lambda: abs(c.height() - 3) < 0.3, 8, "3 m")
+
+
+def setpoint_kept(before):
+    target = c.next("POSITION_TARGET_LOCAL_NED")
+    equal((round(target.x), round(target.z)), before)
+
+
+def speed_change_is_accepted_without_effect():
+    """178 does nothing to setpoints of a client."""
+    equal(c.command(178, [1, 0.5]), ACCEPTED)
+    c.setpoint = (5.0, 0.0, -3.0, 0.0)
+    fastest, end = 0.0, time.monotonic() + 3
+    while time.monotonic() < end:
+        c.turn()
+        fastest = max(fastest, c.latest["LOCAL_POSITION_NED"].vx)
+    assert fastest > 2.0, fastest
+    c.setpoint = (0.0, 0.0, -3.0, 0.0)
+    c.until(lambda: abs(c.latest["LOCAL_POSITION_NED"].x) < 0.3, 10, "back")
+    return f"{fastest:.1f} m/s"
+
+
+def empty_setpoint_is_dropped():
+    c.setpoint, c.mask = (9.0, 0.0, -9.0, 0.0), 0xDFF
+    c.run(0.5)
+    setpoint_kept((0, -3))
+    c.setpoint, c.mask = (0.0, 0.0, -3.0, 0.0), 0x9F8
+    c.run(0.5)
+    equal(c.mode(), OFFBOARD)
+
+
+def targets_of_setpoints():
+    """System 0 is everybody; another system's setpoints are not this vehicle's."""
+    c.setpoint, c.target = (2.0, 0.0, -3.0, 0.0), 0
+    c.until(lambda: abs(c.latest["LOCAL_POSITION_NED"].x - 2) < 0.4, 10, "flown for target 0")
+    c.setpoint, c.target = (0.0, 0.0, -3.0, 0.0), 1
+    c.until(lambda: abs(c.latest["LOCAL_POSITION_NED"].x) < 0.4, 10, "back")
+    c.setpoint, c.target = (9.0, 0.0, -3.0, 0.0), 77
+    c.run(0.6)
+    setpoint_kept((0, -3))
+    c.setpoint, c.target = (0.0, 0.0, -3.0, 0.0), 1
+    c.run(0.5)
+    equal(c.mode(), OFFBOARD)
+
+
+def velocity_in_the_bodys_frame():
+    """Frame 8 takes velocities: forward is where the nose points, here north."""
+    c.setpoint = None
+    forward = 0.0
+    for _ in range(40):
+        c.link.mav.set_position_target_local_ned_send(0, 1, 1, 8, 0xDC7, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0)
+        c.run(0.05)
+        forward = max(forward, c.latest["LOCAL_POSITION_NED"].vx)
+    assert 0.6 < forward < 1.5, forward
+    c.setpoint = (0.0, 0.0, -3.0, 0.0)
+    c.until(lambda: abs(c.latest["LOCAL_POSITION_NED"].x) < 0.4, 10, "back")
+    equal(c.mode(), OFFBOARD)
+    return f"{forward:.2f} m/s"
+
+
+def modes_of_the_autopilot():
+    """176 with AUTO modes: Land and Return fly, a mission that is not there does not; OFFBOARD takes it back."""
+    for mode in (HOLD, LAND, RETURN):
+        equal(c.set_mode(mode), ACCEPTED)
+        c.wait_mode(mode)
+    equal(c.set_mode(MISSION), REJECTED)
+    equal(c.mode(), RETURN)
+    equal(c.set_mode(OFFBOARD), ACCEPTED)
+    c.wait_mode(OFFBOARD)
+    c.until(lambda: abs(c.height() - 3) < 0.4, 10, "3 m again")
 
 
 def unknown_frame_is_dropped():
@@ -378,6 +488,48 @@ def land_while_the_stream_goes_on():
     return f"disarmed after {after:.1f} s"
 
 
+def takeoff_in_offboard():
+    """No TAKEOFF command: armed in OFFBOARD, a setpoint above lifts it."""
+    c.setpoint = (0.0, 0.0, -2.5, 0.0)
+    c.run(1.2)
+    equal(c.set_mode(OFFBOARD), ACCEPTED)
+    c.until(c.can_arm, 5, "PREARM_CHECK in OFFBOARD with a stream")
+    equal(c.command(400, [1]), ACCEPTED)
+    started = time.monotonic()
+    c.until(lambda: c.height() > 2.0, 12, "2 m")
+    return f"2 m after {time.monotonic() - started:.1f} s"
+
+
+def ground_station_lost_in_flight():
+    """NAV_DLL_ACT=2: Hold, then return; a station that is back cancels nothing until a mode is commanded."""
+    c.set_param("NAV_DLL_ACT", 2, INT)
+    c.beat_at = time.monotonic() + 60
+    c.until(lambda: c.mode() == HOLD, 14, "Hold")
+    equal(c.latest["HEARTBEAT"].system_status, 5)
+    c.wait_mode(RETURN, 8)
+    c.beat_at = 0.0
+    c.run(2)
+    equal(c.mode(), RETURN)
+    c.set_param("NAV_DLL_ACT", 0, INT)
+    equal(c.set_mode(OFFBOARD), ACCEPTED)
+    c.wait_mode(OFFBOARD)
+    c.until(lambda: abs(c.height() - 2.5) < 0.5, 40, "back at 2.5 m")
+
+
+def lost_setpoints_return_by_default():
+    """COM_OBL_RC_ACT=0 without a remote control."""
+    c.set_param("COM_OBL_RC_ACT", 0, INT)
+    c.setpoint = None
+    c.wait_mode(RETURN, 5)
+    equal(c.latest["HEARTBEAT"].system_status, 5)
+    c.set_param("COM_OBL_RC_ACT", 5, INT)
+    equal(c.set_mode(LAND), ACCEPTED)
+    c.wait_mode(LAND)
+    c.until(lambda: not c.armed(), 40, "disarmed")
+    equal(c.set_mode(HOLD), ACCEPTED)
+    c.until(c.can_arm, 5, "PREARM_CHECK in Hold")
+
+
 def preflight_disarm():
     equal(c.command(400, [1]), ACCEPTED)
     started = time.monotonic()
@@ -388,14 +540,25 @@ def preflight_disarm():
     return f"after {after:.1f} s"
 
 
-def battery():
-    """Drains quickly: warning, then Hold and return at critical, then landing at the emergency level."""
-    c.set_param("COM_LOW_BAT_ACT", 3, INT)
-    c.set_param("SIM_BAT_MIN_PCT", 0.0, REAL)
+def battery_floor():
+    """SIM_BAT_MIN_PCT stops the drain; the vehicle stays in the air for the next check."""
     equal(c.command(400, [1]), ACCEPTED)
     equal(c.command(22, []), ACCEPTED)
     c.wait_mode(HOLD, 20)
     c.until(lambda: c.height() > 2.0, 10, "height")
+    c.set_param("SIM_BAT_MIN_PCT", 50.0, REAL)
+    c.set_param("SIM_BAT_DRAIN", 10.0, REAL)
+    c.until(lambda: "BATTERY_STATUS" in c.latest and c.latest["BATTERY_STATUS"].battery_remaining <= 50, 10, "50 %")
+    c.run(3)
+    equal(c.next("BATTERY_STATUS", 4).battery_remaining, 50)
+    equal(c.mode(), HOLD)
+
+
+def battery():
+    """Drains quickly: warning, then Hold and return at critical, then landing at the emergency level."""
+    c.set_param("SIM_BAT_DRAIN", 60.0, REAL)
+    c.set_param("COM_LOW_BAT_ACT", 3, INT)
+    c.set_param("SIM_BAT_MIN_PCT", 0.0, REAL)
     states = []
 
     def charge():
@@ -405,7 +568,6 @@ def battery():
         return state
 
     equal(charge(), 1)
-    c.set_param("SIM_BAT_DRAIN", 60.0, REAL)
     c.until(lambda: charge() == 2, 70, "low")
     c.set_param("SIM_BAT_DRAIN", 300.0, REAL)
     equal(c.mode(), HOLD)
@@ -421,6 +583,12 @@ def battery():
     c.until(lambda: charge() == 4, 4, "emergency")
     c.until(lambda: not c.armed(), 60, "disarmed")
     equal(states, [1, 2, 3, 4])
+
+
+def acknowledgements_are_quick():
+    """Measured 10 ms on PX4; clients give up after 500."""
+    assert c.slowest_ack_s < 0.25, c.slowest_ack_s
+    return f"at most {c.slowest_ack_s * 1e3:.0f} ms"
 
 
 def texts():
@@ -440,16 +608,24 @@ check("ack-unused-parameter", lambda: equal(c.command(400, [1, 0, 7, 0, 0, 0, 0]
 check("ack-unused-parameter-of-return", lambda: equal(c.command(20, [1]), DENIED))
 check("ack-unknown-message", lambda: equal(c.command(512, [9999]), DENIED))
 check("ack-legacy-request", lambda: equal(c.command(520, [1]), UNSUPPORTED))
+check("ack-unused-parameters-of-flight", unused_parameters)
 check("no-ack-for-another-target", wrong_target)
 check("gimbal-denied-without-control", gimbal_denied)
 check("gimbal-control", gimbal_control)
 check("gimbal-set-attitude", gimbal_message)
+check("gimbal-set-pitchyaw-ignored", gimbal_set_pitchyaw_is_ignored)
 check("arming-needs-ground-station", gcs_needed)
+check("no-texts-without-ground-station", no_texts_without_a_ground_station)
 check("offboard-on-the-ground-without-stream", offboard_without_stream_on_ground)
 check("takeoff", takeoff)
 check("rejections-in-the-air", in_the_air)
 check("offboard-at-the-first-setpoint", offboard_at_the_first_setpoint)
 check("unknown-frame-is-dropped", unknown_frame_is_dropped)
+check("empty-setpoint-is-dropped", empty_setpoint_is_dropped)
+check("setpoints-by-target", targets_of_setpoints)
+check("velocity-in-body-frame", velocity_in_the_bodys_frame)
+check("speed-change-without-effect", speed_change_is_accepted_without_effect)
+check("auto-modes", modes_of_the_autopilot)
 check("short-gap-is-harmless", a_short_gap_is_harmless)
 check("lost-setpoints-hold", lost_setpoints_hold)
 check("resumed-stream-flies-again", resumed_stream_flies_again)
@@ -457,8 +633,13 @@ check("hold-stands-against-resumed-stream", hold_stands_against_a_resumed_stream
 check("velocity-limit", velocity_limit)
 check("geofence-holds", geofence_holds)
 check("land-while-the-stream-goes-on", land_while_the_stream_goes_on)
+check("takeoff-in-offboard", takeoff_in_offboard)
+check("ground-station-lost-in-flight", ground_station_lost_in_flight)
+check("lost-setpoints-return-by-default", lost_setpoints_return_by_default)
 check("preflight-disarm", preflight_disarm)
+check("battery-floor", battery_floor)
 check("battery-warns-returns-lands", battery)
+check("ack-latency", acknowledgements_are_quick)
 check("texts", texts)
 print(f"{passed} passed, {failed} failed")
 sys.exit(1 if failed else 0)

@@ -63,6 +63,14 @@ impl Ports {
         })
     }
 
+    /// Says which mission the ids of requests count in.
+    pub fn count_within(&mut self, mission: u64) {
+        self.vehicle.count_within(mission);
+        self.captures.count_within(mission);
+        self.rounds.count_within(mission);
+        self.scores.count_within(mission);
+    }
+
     /// Everything that was sent before now.
     ///
     /// # Errors

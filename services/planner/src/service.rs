@@ -1,7 +1,7 @@
 //! The planner as a service: receive, decide, write down, act.
 
 use shared_types::folder::{FolderError, MissionFolder};
-use shared_types::messages::{MissionCommand, ServiceState};
+use shared_types::messages::{MissionCommand, ServiceState, mission_key};
 use shared_types::service::{Context, HealthReport, Service, ServiceError, Step, StopAnswer};
 
 use crate::journal::Journal;
@@ -29,7 +29,7 @@ impl Planner {
     ///
     /// # Errors
     /// When no folder is configured, or it or its journal cannot be opened.
-    pub fn new(ports: Ports, context: &Context) -> anyhow::Result<Self> {
+    pub fn new(mut ports: Ports, context: &Context) -> anyhow::Result<Self> {
         let config = &context.config;
         let root = &config.mission.folder;
         anyhow::ensure!(
@@ -48,6 +48,7 @@ impl Planner {
             folder: root.clone(),
             seed: config.mission.seed,
         };
+        ports.count_within(mission_key(&setup.mission_id, &setup.folder));
         tracing::info!(entries = entries.len(), "the journal is read");
         let mission = Mission::new(setup, &entries);
         Ok(Self {

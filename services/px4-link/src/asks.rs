@@ -35,6 +35,21 @@ pub enum Ask {
     Set(&'static str, i32),
 }
 
+fn command(command: MavCmd, first: f32, second: f32) -> Ask {
+    let mut parameters = [f32::NAN; 7];
+    parameters[0] = first;
+    parameters[1] = second;
+    Ask::Command(command, parameters)
+}
+
+impl Ask {
+    /// Asks where the estimator has its origin.
+    #[must_use]
+    pub fn origin() -> Self {
+        command(MavCmd::MAV_CMD_REQUEST_MESSAGE, 49.0, f32::NAN)
+    }
+}
+
 /// The questions, in order.
 #[derive(Debug, Clone, Default)]
 pub struct Asks {
@@ -48,12 +63,6 @@ impl Asks {
     /// Everything, from the start.
     #[must_use]
     pub fn all() -> Self {
-        let command = |command, first: f32, second: f32| {
-            let mut parameters = [f32::NAN; 7];
-            parameters[0] = first;
-            parameters[1] = second;
-            Ask::Command(command, parameters)
-        };
         #[expect(clippy::cast_precision_loss, reason = "message ids are small")]
         let requests = MESSAGES.iter().map(|&id| command(MavCmd::MAV_CMD_REQUEST_MESSAGE, id as f32, f32::NAN));
         #[expect(clippy::cast_precision_loss, reason = "message ids are small")]

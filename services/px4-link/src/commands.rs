@@ -33,6 +33,8 @@ pub enum Stage {
     Arm,
     /// Wait until somebody has armed.
     UntilArmed,
+    /// Command to disarm, which the autopilot does on the ground only.
+    Disarm,
     /// Command to take off to a height above the sea, metres.
     Takeoff {
         /// Metres.
@@ -221,7 +223,7 @@ impl Procedure {
             Stage::UntilSlow => view.speed_mps < 0.3 || age_ns > 2_000_000_000,
             Stage::StreamPose => view.streaming && age_ns >= STREAM_FIRST_NS,
             Stage::FlyBack => view.flown_back && age_ns > 0,
-            Stage::UntilDisarmed => !view.armed,
+            Stage::Disarm | Stage::UntilDisarmed => !view.armed,
         }
     }
 
@@ -265,9 +267,9 @@ impl Procedure {
 fn command_of(stage: Stage) -> Option<(MavCmd, [f32; 7])> {
     match stage {
         Stage::Mode { mode, .. } => Some(set_mode(mode)),
-        Stage::Arm => {
+        Stage::Arm | Stage::Disarm => {
             let mut params = NAN7;
-            params[0] = 1.0;
+            params[0] = if stage == Stage::Arm { 1.0 } else { 0.0 };
             Some((MavCmd::MAV_CMD_COMPONENT_ARM_DISARM, params))
         }
         Stage::Takeoff { above_sea_m } => {
@@ -285,6 +287,7 @@ fn stage_name(stage: Stage) -> String {
     match stage {
         Stage::Mode { mode, .. } => format!("the mode {mode}"),
         Stage::Arm => "arming".to_owned(),
+        Stage::Disarm => "disarming".to_owned(),
         Stage::Takeoff { .. } => "the takeoff".to_owned(),
         other => format!("{other:?}"),
     }
@@ -309,99 +312,11 @@ fn give_up(stage: Stage, age_ns: u64) -> Option<String> {
         Stage::StreamPose => (5, "no setpoint can be sent"),
         Stage::FlyBack => (180, "the return path is not flown to its end"),
         Stage::UntilDisarmed => (300, "the vehicle does not land and disarm"),
-        Stage::Mode { .. } | Stage::Arm | Stage::Takeoff { .. } | Stage::UntilSlow => return None,
+        Stage::Mode { .. } | Stage::Arm | Stage::Disarm | Stage::Takeoff { .. } | Stage::UntilSlow => return None,
     };
     (age_ns > limit_s * shared_types::NS_PER_S).then(|| reason.to_owned())
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    fn view(now_ms: u64, mode: FlightMode) -> View {
-        View {
-            now_ns: now_ms * 1_000_000,
-            mode,
-            armed: true,
-            landed: false,
-            armable: true,
-            speed_mps: 0.0,
-            flown_back: false,
-            streaming: true,
-        }
-    }
-
-    fn hold() -> Procedure {
-        Procedure::new(VehicleCommand::Hold, &[Stage::Mode { mode: FlightMode::Hold, always: false }])
-    }
-
-    fn sent(wishes: &[Wish]) -> Option<u8> {
-        wishes
-            .iter()
-            .find_map(|wish| if let Wish::Command(_, _, confirmation) = wish { Some(*confirmation) } else { None })
-    }
-
-    #[test]
-    fn an_acknowledgement_alone_confirms_nothing() {
-        let mut procedure = hold();
-        assert_eq!(sent(&procedure.turn(&view(0, FlightMode::Offboard)).0), Some(0));
-        procedure.acknowledged(10_000_000, MavCmd::MAV_CMD_DO_SET_MODE, MavResult::MAV_RESULT_ACCEPTED);
-        assert_eq!(procedure.turn(&view(20, FlightMode::Offboard)).1, Outcome::Working);
-        assert_eq!(procedure.turn(&view(30, FlightMode::Hold)).1, Outcome::Done);
-    }
-
-    #[test]
-    fn four_tries_without_an_answer_fail_and_count_up() {
-        let mut procedure = hold();
-        let mut counts = Vec::new();
-        for ms in (0..4_000).step_by(10) {
-            let (wishes, outcome) = procedure.turn(&view(ms, FlightMode::Offboard));
-            counts.extend(sent(&wishes));
-            if let Outcome::Failed(reason) = outcome {
-                assert!(ms == 2_000 && reason.contains("not acknowledged"), "{ms} {reason}");
-                assert_eq!(counts, [0, 1, 2, 3]);
-                return;
-            }
-        }
-        panic!("never failed");
-    }
-
-    #[test]
-    fn accepted_without_effect_is_said_so_and_denial_ends_at_once() {
-        let mut procedure = hold();
-        let mut reason = None;
-        for ms in (0..20_000).step_by(10) {
-            let (wishes, outcome) = procedure.turn(&view(ms, FlightMode::Offboard));
-            if sent(&wishes).is_some() {
-                procedure.acknowledged(ms, MavCmd::MAV_CMD_DO_SET_MODE, MavResult::MAV_RESULT_ACCEPTED);
-            }
-            if let Outcome::Failed(text) = outcome {
-                reason = Some(text);
-                break;
-            }
-        }
-        assert!(reason.is_some_and(|text| text.contains("without effect")));
-        let mut denied = hold();
-        denied.turn(&view(0, FlightMode::Offboard));
-        let answer = denied.acknowledged(1, MavCmd::MAV_CMD_DO_SET_MODE, MavResult::MAV_RESULT_DENIED);
-        assert!(answer.is_some_and(|text| text.contains("denied")));
-    }
-
-    #[test]
-    fn a_failsafes_hold_is_commanded_all_the_same() {
-        let mut procedure =
-            Procedure::new(VehicleCommand::TakeControl, &[Stage::Mode { mode: FlightMode::Hold, always: true }]);
-        assert_eq!(sent(&procedure.turn(&view(0, FlightMode::Hold)).0), Some(0));
-        procedure.acknowledged(1, MavCmd::MAV_CMD_DO_SET_MODE, MavResult::MAV_RESULT_ACCEPTED);
-        assert_eq!(procedure.turn(&view(10, FlightMode::Hold)).1, Outcome::Done);
-    }
-
-    #[test]
-    fn unused_parameters_are_not_numbers() {
-        for stage in [Stage::Arm, Stage::Takeoff { above_sea_m: 490.0 }] {
-            let (_, params) = command_of(stage).expect("a command");
-            assert_eq!(params.iter().filter(|p| p.is_nan()).count(), 6);
-        }
-        assert_eq!(set_mode(FlightMode::Land).1[..3], [1.0, 4.0, 6.0]);
-    }
-}
+#[path = "commands_tests.rs"]
+mod tests;

@@ -124,13 +124,19 @@ struct LastFix {
 pub struct WorldTransform {
     kept: KeptTransform,
     last: Option<LastFix>,
+    /// The origin was heard since px4-link is (back) here.
+    origin_checked: bool,
+    /// It was another one than before.
+    origin_moved: bool,
+    /// The reset counter was another one than before.
+    reset_away: bool,
 }
 
 impl WorldTransform {
     /// Goes on with the transform of an earlier life.
     #[must_use]
     pub fn new(kept: KeptTransform) -> Self {
-        Self { kept, last: None }
+        Self { kept, ..Self::default() }
     }
 
     /// What to store.
@@ -184,7 +190,10 @@ impl WorldTransform {
             }
         } else if announced {
             // The estimator reset while px4-link was away: how far is unknown unless its origin moved, which `origin` sees.
-            self.kept.reset_count = self.kept.reset_count.saturating_add(1);
+            self.reset_away = true;
+            if !self.origin_moved {
+                self.kept.reset_count = self.kept.reset_count.saturating_add(1);
+            }
         }
         if counter.is_some() {
             self.kept.reset_counter = counter;
@@ -193,20 +202,40 @@ impl WorldTransform {
         self.world_from_ned(ned_m)
     }
 
-    /// Takes the estimator's origin. When it moved while px4-link was away, the transform moves with it; while px4-link
-    /// watches, the jump of the position itself has already been taken.
+    /// Takes the estimator's origin. When it moved while px4-link was away, the transform moves with it, whether positions
+    /// were heard before the origin or not; while px4-link watches, the jump of the position itself has already been taken.
     pub fn origin(&mut self, origin: EarthOrigin) {
-        if let (Some(old), None) = (self.kept.origin, self.last)
+        if let (Some(old), false) = (self.kept.origin, self.origin_checked)
             && old != origin
         {
+            self.origin_moved = true;
+            let counted = self.kept.reset_count;
             self.shift(old.offset_to(&origin));
+            if self.reset_away {
+                self.kept.reset_count = counted;
+            }
         }
+        self.origin_checked = true;
         self.kept.origin = Some(origin);
     }
 
-    /// Forgets the last fix: after a stall, the next one is no jump.
+    /// Whether the estimator was reset while px4-link was away and its origin does not say by how much.
+    #[must_use]
+    pub fn moved_unexplained(&self) -> bool {
+        self.reset_away && !self.origin_moved
+    }
+
+    /// Goes on with the world as it is: the vehicle was looked at.
+    pub fn accept(&mut self) {
+        self.reset_away = false;
+        self.origin_moved = false;
+    }
+
+    /// px4-link was away: the next fix is no jump, and the origin has to be heard again.
     pub fn forget_last(&mut self) {
         self.last = None;
+        self.origin_checked = false;
+        self.accept();
     }
 }
 
@@ -289,5 +318,26 @@ mod tests {
         world.origin(EarthOrigin { latitude_e7: old.latitude_e7 + 1000, altitude_mm: old.altitude_mm + 2000, ..old });
         // 1e-4 deg of latitude are 11.12 m: the new origin lies that far north, so its zero is there in the world.
         assert!((world.offset_m() - DVec3::new(0.0, 11.12, 2.0)).length() < 0.01);
+    }
+
+    #[test]
+    fn an_origin_that_is_heard_after_the_position_counts_all_the_same_and_a_reset_without_one_is_told() {
+        let old = EarthOrigin { latitude_e7: 473_977_435, longitude_e7: 85_455_941, altitude_mm: 489_367 };
+        let kept = KeptTransform { origin: Some(old), reset_counter: Some(4), ..KeptTransform::default() };
+        let mut world = WorldTransform::new(kept);
+        world.fix(1, DVec3::ZERO, DVec3::ZERO, Some(5));
+        assert!(world.moved_unexplained());
+        world.origin(EarthOrigin { altitude_mm: old.altitude_mm + 2000, ..old });
+        assert!(!world.moved_unexplained() && world.reset_count() == 1);
+        assert!((world.fix(20_000_000, DVec3::ZERO, DVec3::ZERO, Some(5)).z - 2.0).abs() < 1e-9);
+        // The same origin again, and one that moves while px4-link watches, change nothing.
+        world.origin(old);
+        assert!((world.offset_m().z - 2.0).abs() < 1e-9);
+        let mut unexplained = WorldTransform::new(kept);
+        unexplained.fix(1, DVec3::ZERO, DVec3::ZERO, Some(5));
+        unexplained.origin(old);
+        assert!(unexplained.moved_unexplained() && unexplained.offset_m() == DVec3::ZERO);
+        unexplained.accept();
+        assert!(!unexplained.moved_unexplained());
     }
 }

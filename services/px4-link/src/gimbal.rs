@@ -17,8 +17,11 @@ const YAW_IN_EARTH: u16 = 64;
 const DEMAND_FLAGS: f32 = 12.0;
 const PERIOD_NS: u64 = 200_000_000;
 const REFRESH_NS: u64 = 2_000_000_000;
-/// Heartbeats without an answer after which there is no gimbal.
-const PATIENCE: u64 = 5;
+/// Time without an answer, after everything else was answered, after which there is no gimbal.
+const PATIENCE_NS: u64 = 5_000_000_000;
+
+/// What is said where no gimbal answers.
+pub const NO_GIMBAL: &str = "no gimbal answers (MNT_MODE_IN = 4?): the camera is taken as fixed to the body";
 
 /// The gimbal as far as it is known.
 #[derive(Debug, Clone, Default)]
@@ -35,6 +38,8 @@ pub struct Gimbal {
     controlled: bool,
     last_pitch_rad: f64,
     last_sent_ns: Option<u64>,
+    asked_ns: Option<u64>,
+    warned: bool,
 }
 
 impl Gimbal {
@@ -46,8 +51,23 @@ impl Gimbal {
 
     /// Whether it is settled that there is none.
     #[must_use]
-    pub fn absent(&self, heartbeats: u64) -> bool {
-        !self.present() && heartbeats >= PATIENCE
+    pub fn absent(&self, now_ns: u64, synced_ns: Option<u64>) -> bool {
+        !self.present() && synced_ns.is_some_and(|synced_ns| now_ns.saturating_sub(synced_ns) >= PATIENCE_NS)
+    }
+
+    /// The command that asks whether there is one, every five seconds. Its absence is said once.
+    pub fn ask(&mut self, now_ns: u64, synced_ns: u64) -> Option<(MavCmd, [f32; 7])> {
+        if !self.warned && self.absent(now_ns, Some(synced_ns)) {
+            self.warned = true;
+            tracing::warn!("{NO_GIMBAL}");
+        }
+        if self.asked_ns.is_some_and(|asked_ns| now_ns < asked_ns + PATIENCE_NS) {
+            return None;
+        }
+        self.asked_ns = Some(now_ns);
+        let mut params = [f32::NAN; 7];
+        params[0] = 280.0;
+        Some((MavCmd::MAV_CMD_REQUEST_MESSAGE, params))
     }
 
     /// Takes the manager's description.
@@ -174,7 +194,12 @@ mod tests {
     #[test]
     fn control_is_taken_first_and_again_after_a_denial_and_demands_are_rare() {
         let mut gimbal = Gimbal::default();
-        assert!(gimbal.demand(0, -0.5, (1, 191)).is_none() && gimbal.absent(5) && !gimbal.absent(4));
+        assert!(gimbal.demand(0, -0.5, (1, 191)).is_none() && !gimbal.absent(9_000_000_000, None));
+        assert!(
+            gimbal.absent(9_000_000_000, Some(4_000_000_000)) && !gimbal.absent(8_000_000_000, Some(4_000_000_000))
+        );
+        let asked = (0..1200).filter(|i| gimbal.ask(i * 10_000_000, 0).is_some()).count();
+        assert!(asked == 3 && gimbal.warned, "{asked} in twelve seconds");
         gimbal.information(&GIMBAL_MANAGER_INFORMATION_DATA {
             pitch_min: -0.7,
             pitch_max: 0.7,

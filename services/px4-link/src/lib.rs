@@ -40,6 +40,8 @@ use stream::{GAP_BORDERS_MS, Settings};
 
 /// `vehicle/state` is published at 50 Hz.
 const STATE_PERIOD_NS: u64 = 20_000_000;
+/// A turn that comes later than this after the one before is as after a restart.
+const STALL_NS: u64 = 500_000_000;
 
 struct Px4Link {
     ports: Ports,
@@ -49,6 +51,7 @@ struct Px4Link {
     runner: Runner,
     lockstep: bool,
     published_ns: Option<u64>,
+    turned_ns: Option<u64>,
     trouble: Option<String>,
 }
 
@@ -56,6 +59,12 @@ impl Service for Px4Link {
     fn step(&mut self, now_ns: u64) -> Result<Step, ServiceError> {
         if !self.lockstep {
             self.link.take_all();
+            // Stopped or stalled: what has come meanwhile tells of a vehicle that somebody else may fly by now.
+            if self.turned_ns.is_some_and(|turned_ns| now_ns.saturating_sub(turned_ns) > STALL_NS) {
+                tracing::warn!("px4-link did not run for more than 0.5 s: looking at the vehicle anew");
+                Service::rejoin(self, now_ns);
+            }
+            self.turned_ns = Some(now_ns);
         }
         while let Some(received) = self.link.next_message() {
             self.core.on_message(now_ns, &received);
@@ -149,6 +158,7 @@ pub fn run(mut context: Context) -> anyhow::Result<()> {
         runner,
         lockstep,
         published_ns: None,
+        turned_ns: None,
         trouble: None,
     };
     let result = context.run(&mut service);

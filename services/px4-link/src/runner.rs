@@ -1,12 +1,15 @@
 //! Where the streamer runs: in line in lockstep, on a thread of its own on the wall's clock.
 //!
-//! The thread opens no file and no channel. Its orders come through a bounded queue that never blocks the sender; what it
+//! The thread opens no file and no channel, its stack and slot are locked in memory, and it runs before others (SCHED_FIFO)
+//! where that is permitted. Its orders come through a bounded queue that never blocks the sender; what it
 //! says of itself goes back through another. A link that stalls leaves it streaming: the planner's sign of life then grows
 //! old, and it brakes.
 
 use std::collections::VecDeque;
 use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, TrySendError, sync_channel};
 use std::time::{Duration, Instant};
+
+use shared_types::realtime;
 
 use crate::logic::setpoint_message;
 use crate::mavlink_io::Sender;
@@ -15,6 +18,10 @@ use crate::stream::{Order, Report, Settings, Streamer};
 const ORDERS: usize = 512;
 const REPORTS: usize = 64;
 const IDLE: Duration = Duration::from_millis(100);
+/// Of the setpoint thread: small, so that what is locked of it is most of it.
+const STACK: usize = 4 * realtime::STACK_BYTES;
+/// Priority of SCHED_FIFO, where permitted.
+const PRIORITY: u8 = 20;
 
 /// The streamer, wherever it runs.
 #[derive(Debug)]
@@ -57,6 +64,7 @@ impl Runner {
         let newest = Box::new(streamer.report());
         std::thread::Builder::new()
             .name("setpoints".to_owned())
+            .stack_size(STACK)
             .spawn(move || run(streamer, &sender, &orders_in, &reports_out, now_ns))?;
         Ok(Self::Thread { orders, waiting: VecDeque::new(), reports, newest })
     }
@@ -108,7 +116,24 @@ impl Runner {
     }
 }
 
+/// Asks for the thread what keeps it in time; what is not permitted is said once and left.
+fn become_punctual(streamer: &Streamer) {
+    use thread_priority::unix::{set_thread_priority_and_policy, thread_native_id};
+    use thread_priority::{RealtimeThreadSchedulePolicy, ThreadPriority, ThreadPriorityValue, ThreadSchedulePolicy};
+
+    if let Err(error) = realtime::lock_stack().and_then(|()| realtime::lock_value(streamer)) {
+        tracing::info!(%error, "the setpoint thread's memory cannot be locked (ulimit -l): it may be paged out");
+    }
+    let fifo = ThreadSchedulePolicy::Realtime(RealtimeThreadSchedulePolicy::Fifo);
+    let asked = ThreadPriorityValue::try_from(PRIORITY)
+        .map(|value| set_thread_priority_and_policy(thread_native_id(), ThreadPriority::Crossplatform(value), fifo));
+    if !matches!(asked, Ok(Ok(()))) {
+        tracing::debug!("SCHED_FIFO is not permitted for the setpoint thread");
+    }
+}
+
 fn run(mut streamer: Streamer, sender: &Sender, orders: &Receiver<Order>, reports: &SyncSender<Report>, epoch_ns: u64) {
+    become_punctual(&streamer);
     let started = Instant::now();
     let now = || epoch_ns + u64::try_from(started.elapsed().as_nanos()).unwrap_or(u64::MAX / 2);
     loop {

@@ -114,7 +114,8 @@ pub enum Found {
     LeaveTo(Commander),
 }
 
-/// Decides what to do with a vehicle found in the air after a start or a stall.
+/// Decides what to do with a vehicle found in the air after a start or a stall. `ours`: it is in the mode that we commanded
+/// last, so that a Hold that an operator commanded meanwhile is not taken for our own.
 #[must_use]
 pub fn found_in_air(mode: FlightMode, intended: FlightMode, charge: ChargeState, fence: bool, ours: bool) -> Found {
     if fence || matches!(charge, ChargeState::Critical | ChargeState::Emergency) {
@@ -174,8 +175,8 @@ mod tests {
         let ok = ChargeState::Ok;
         assert_eq!(found_in_air(Hold, Offboard, ok, false, false), Found::Recover);
         assert_eq!(found_in_air(Offboard, Offboard, ok, false, false), Found::Recover);
-        assert_eq!(found_in_air(Hold, Hold, ok, false, true), Found::Ours);
-        assert_eq!(found_in_air(Hold, Hold, ok, false, false), Found::LeaveTo(Commander::Pilot));
+        assert_eq!(found_in_air(Hold, Hold, ok, false, true), Found::Ours, "our own Hold");
+        assert_eq!(found_in_air(Hold, Hold, ok, false, false), Found::LeaveTo(Commander::Pilot), "an operator's Hold");
         for mode in [Pilot, Return, Land] {
             assert_eq!(found_in_air(mode, mode, ok, false, true), Found::LeaveTo(Commander::Pilot));
         }

@@ -5,7 +5,7 @@ use std::io::Write as _;
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
-use shared_types::messages::Waypoint;
+use shared_types::messages::{FlightMode, Waypoint};
 
 use crate::frames::KeptTransform;
 
@@ -44,14 +44,49 @@ impl WayBack {
 }
 
 /// What is remembered of the flight.
-#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
 pub struct Kept {
     /// World from local.
     pub transform: KeptTransform,
     /// Whether the vehicle flew by our command.
     pub ours: bool,
-    /// Ids up to this one were seen as targets.
+    /// The mode that we last commanded.
+    pub expected: FlightMode,
+    /// The mode before that, until the commanded one was seen.
+    pub before_expected: FlightMode,
+    /// A flight of ours was not yet followed by Hold on the ground.
+    pub flown: bool,
+    /// The mission of the last target: ids count within a mission.
+    pub mission: u64,
+    /// Ids up to this one were seen as targets of that mission.
     pub last_target_id: u64,
+}
+
+impl Default for Kept {
+    fn default() -> Self {
+        Self {
+            transform: KeptTransform::default(),
+            ours: false,
+            expected: FlightMode::Unknown,
+            before_expected: FlightMode::Unknown,
+            flown: false,
+            mission: 0,
+            last_target_id: 0,
+        }
+    }
+}
+
+impl Kept {
+    /// Whether a vehicle in this mode flies as we last told it to: in the mode that we commanded, in the one before it
+    /// while that command was not seen to be obeyed, or holding after our takeoff.
+    #[must_use]
+    pub fn commanded(&self, mode: FlightMode) -> bool {
+        self.ours
+            && (mode == self.expected
+                || mode == self.before_expected
+                || (self.expected == FlightMode::Takeoff && mode == FlightMode::Hold))
+    }
 }
 
 /// The files.
@@ -128,5 +163,17 @@ mod tests {
         assert_eq!((store.kept(), store.way_back().waypoints().len()), (kept, 1));
         std::fs::write(folder.path().join("px4-link.json"), b"{\"ours\":tr").expect("written");
         assert_eq!(store.kept(), Kept::default());
+        std::fs::write(folder.path().join("px4-link.json"), b"{\"last_target_id\":3}").expect("written");
+        assert_eq!(store.kept().last_target_id, 3, "a file of an older version");
+    }
+
+    #[test]
+    fn only_the_mode_that_we_commanded_is_ours() {
+        use FlightMode::{Hold, Offboard, Takeoff};
+        let of = |expected, before_expected| Kept { ours: true, expected, before_expected, ..Kept::default() };
+        assert!(of(Hold, Hold).commanded(Hold) && of(Takeoff, Takeoff).commanded(Hold));
+        assert!(!of(Offboard, Offboard).commanded(Hold), "an operator's Hold");
+        assert!(of(Offboard, Hold).commanded(Hold), "OFFBOARD was commanded and not yet seen");
+        assert!(!Kept { ours: false, ..of(Hold, Hold) }.commanded(Hold));
     }
 }

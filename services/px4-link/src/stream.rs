@@ -11,6 +11,11 @@ use crate::setpoint::{Generator, PERIOD_S, Plan, Setpoint, leashed, share_of_spe
 
 /// Time between setpoints, nanoseconds.
 const PERIOD_NS: u64 = 50_000_000;
+/// Telemetry older than this: the setpoint stays where it is.
+const QUIET_NS: u64 = 500_000_000;
+/// Telemetry older than this: nothing is sent. Just below the autopilot's own limit for setpoints (COM_OF_LOSS_T), so that
+/// a link that comes back after a failsafe does not find a stream that flies it on, from where it no longer is.
+const DEAF_NS: u64 = 900_000_000;
 /// A gap beyond this is a restart: the autopilot may have taken over.
 const STALL_NS: u64 = 500_000_000;
 /// Upper borders of the histogram of gaps, milliseconds; the last class has none.
@@ -27,6 +32,8 @@ pub enum Order {
         speed_mps: f64,
         /// Offset, metres.
         offset_m: DVec3,
+        /// Mission time when the autopilot was last heard.
+        heard_ns: u64,
     },
     /// The planner's loop turned at this mission time.
     Alive(u64),
@@ -121,6 +128,7 @@ pub struct Streamer {
     held: bool,
     measured: Option<(DVec3, f64)>,
     offset_m: DVec3,
+    heard_ns: Option<u64>,
     alive_ns: Option<u64>,
     last_sent_ns: Option<u64>,
     sent: u64,
@@ -144,6 +152,7 @@ impl Streamer {
             held: false,
             measured: None,
             offset_m: DVec3::ZERO,
+            heard_ns: None,
             alive_ns: None,
             last_sent_ns: None,
             sent: 0,
@@ -155,9 +164,10 @@ impl Streamer {
     /// Takes an order.
     pub fn order(&mut self, order: Order) {
         match order {
-            Order::Measured { position_m, speed_mps, offset_m } => {
+            Order::Measured { position_m, speed_mps, offset_m, heard_ns } => {
                 self.measured = Some((position_m, speed_mps));
                 self.offset_m = offset_m;
+                self.heard_ns = Some(heard_ns);
             }
             Order::Alive(at_ns) => self.alive_ns = Some(self.alive_ns.map_or(at_ns, |old| old.max(at_ns))),
             Order::Anchor(at) => {
@@ -210,16 +220,22 @@ impl Streamer {
                 *count += 1;
             }
             if gap_ns > STALL_NS {
-                self.order(Order::Off);
-                self.stalled = true;
-                return None;
+                return self.stall();
             }
+        }
+        let deaf_ns = self.heard_ns.map_or(0, |heard_ns| now_ns.saturating_sub(heard_ns));
+        if deaf_ns > DEAF_NS {
+            return self.stall();
         }
         let silent = self.needs_planner
             && self.alive_ns.is_none_or(|alive_ns| now_ns.saturating_sub(alive_ns) > self.settings.planner_timeout_ns);
         self.held = silent && self.target_id != 0;
         let lag_m = self.measured.map_or(0.0, |(at_m, _)| at_m.distance(self.generator.sent().point.position_m));
-        let share = if silent || self.braked { 0.0 } else { share_of_speed(lag_m, self.settings.leash_m) };
+        let share = if silent || self.braked || deaf_ns > QUIET_NS {
+            0.0
+        } else {
+            share_of_speed(lag_m, self.settings.leash_m)
+        };
         let mut setpoint = self.generator.step(share);
         if let Some((at_m, speed_mps)) = self.measured {
             setpoint.point.position_m = leashed(setpoint.point.position_m, at_m, self.settings.leash_m);
@@ -229,6 +245,13 @@ impl Streamer {
         self.last_sent_ns = Some(now_ns);
         self.sent += 1;
         Some(ToSend { setpoint, offset_m: self.offset_m })
+    }
+
+    /// Stops, and says so: control has to be taken anew.
+    fn stall(&mut self) -> Option<ToSend> {
+        self.order(Order::Off);
+        self.stalled = true;
+        None
     }
 
     /// What the streamer says of itself.
@@ -286,11 +309,16 @@ mod tests {
             if alive {
                 streamer.order(Order::Alive(ms * 1_000_000));
             }
+            if let Some((position_m, speed_mps)) = streamer.measured {
+                let heard_ns = ms * 1_000_000;
+                streamer.order(Order::Measured { position_m, speed_mps, offset_m: DVec3::ZERO, heard_ns });
+            }
             if let Some(to_send) = streamer.step(ms * 1_000_000) {
                 let position_m = to_send.setpoint.point.position_m;
                 sent.push(position_m);
                 let position_m = if follows { position_m } else { DVec3::ZERO };
-                streamer.order(Order::Measured { position_m, speed_mps: 0.0, offset_m: DVec3::ZERO });
+                let heard_ns = ms * 1_000_000;
+                streamer.order(Order::Measured { position_m, speed_mps: 0.0, offset_m: DVec3::ZERO, heard_ns });
             }
         }
         sent
@@ -330,6 +358,22 @@ mod tests {
         let sent = fly(&mut streamer, 0, 20_000, true, false);
         assert!(sent.iter().all(|at| at.length() <= 3.0 + 1e-9));
         assert_eq!(streamer.report().status, TargetStatus::Flying);
+    }
+
+    #[test]
+    fn silence_of_the_autopilot_stops_the_setpoint_first_and_then_the_stream() {
+        let mut streamer = streamer();
+        streamer.order(Order::Anchor(Point::default()));
+        streamer.order(flight(DVec3::new(20.0, 0.0, 0.0)));
+        fly(&mut streamer, 0, 4_000, true, true);
+        let mut sent = Vec::new();
+        for ms in (4_000..6_000u64).step_by(10) {
+            streamer.order(Order::Alive(ms * 1_000_000));
+            sent.extend(streamer.step(ms * 1_000_000).map(|to_send| (ms, to_send.setpoint.rate.position_m.x)));
+        }
+        let (last_ms, _) = sent[sent.len() - 1];
+        assert!((4_800..=4_900).contains(&last_ms) && streamer.report().stalled, "{last_ms}");
+        assert!(sent[2].1 > 1.0 && sent[sent.len() - 1].1 < sent[2].1, "braking");
     }
 
     #[test]

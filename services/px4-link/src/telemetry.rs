@@ -15,6 +15,8 @@ const PREARM_BIT: u32 = 0x1000_0000;
 const RC_BIT: u32 = 0x1_0000;
 /// A fix older than this is not fresh, nanoseconds.
 const FRESH_NS: u64 = 500_000_000;
+/// "VANTAGE1": the unique id of Vantage's simulator.
+const SIMULATOR_UID: u64 = 0x5641_4e54_4147_4531;
 /// How long attitudes are kept to resolve the gimbal's yaw, nanoseconds.
 const HISTORY_NS: u64 = 1_000_000_000;
 
@@ -77,8 +79,8 @@ pub struct Telemetry {
     pub home: Option<(DVec3, f64)>,
     /// Wind in the world, m/s.
     pub wind_mps: DVec3,
-    /// AUTOPILOT_VERSION was heard.
-    pub version_heard: bool,
+    /// AUTOPILOT_VERSION's unique id; `None` until it was heard.
+    pub uid: Option<u64>,
     /// Mission time of the last message.
     pub heard_ns: u64,
     /// Mission time of the last heartbeat.
@@ -112,7 +114,7 @@ impl Default for Telemetry {
             charge: ChargeState::Unknown,
             home: None,
             wind_mps: DVec3::ZERO,
-            version_heard: false,
+            uid: None,
             heard_ns: 0,
             heartbeat_ns: 0,
             heartbeats: 0,
@@ -152,6 +154,18 @@ impl Telemetry {
         fresh(self.position_stamp_ns)
             && self.attitude().is_some_and(|sample| fresh(sample.stamp_ns))
             && self.home.is_some()
+    }
+
+    /// After an absence: the modes are not known until they are heard again.
+    pub fn forget_modes(&mut self) {
+        self.mode = FlightMode::Unknown;
+        self.intended = FlightMode::Unknown;
+    }
+
+    /// Whether the autopilot is Vantage's own simulator.
+    #[must_use]
+    pub fn is_our_simulator(&self) -> bool {
+        self.uid == Some(SIMULATOR_UID)
     }
 
     /// Whether it is in the air: armed and not known to stand on the ground.
@@ -299,7 +313,7 @@ impl Telemetry {
                     self.wind_mps = swap_ned_enu(wind);
                 }
             }
-            MavMessage::AUTOPILOT_VERSION(_) => self.version_heard = true,
+            MavMessage::AUTOPILOT_VERSION(m) => self.uid = Some(m.uid),
             MavMessage::STATUSTEXT(m) => {
                 let text = text_of(m.text.as_ref());
                 if m.chunk_seq > 0 {

@@ -96,14 +96,9 @@ impl Simulator {
     ///
     /// # Errors
     /// A parameter of the configuration is unknown or not finite.
-    pub fn new(config: VehicleConfig, instance: u8) -> Result<Self, BadParameter> {
-        let mut vehicle = Vehicle::new(config)?;
-        let id = i32::from(instance) + 1;
-        vehicle.params.set("MAV_SYS_ID", Value::Int(id)).map_err(|source| BadParameter {
-            name: "MAV_SYS_ID".to_owned(),
-            value: f64::from(id),
-            source,
-        })?;
+    pub fn new(mut config: VehicleConfig, instance: u8) -> Result<Self, BadParameter> {
+        config.params.push(("MAV_SYS_ID".to_owned(), f64::from(instance) + 1.0));
+        let vehicle = Vehicle::new(config)?;
         let system_id = vehicle.system_id();
         Ok(Self {
             vehicle,

@@ -6,6 +6,8 @@ use std::collections::BTreeMap;
 const SECOND_NS: u64 = 1_000_000_000;
 /// No message goes out more often than each tick.
 const SHORTEST_NS: u64 = crate::vehicle::TICK_NS;
+/// Longest interval that is kept, an hour, us: a sum with the time since boot stays in range.
+const LONGEST_US: f64 = 3.6e9;
 
 /// Rates of PX4's onboard link as measured over 45 s of the real autopilot: (message id, Hz times 100).
 pub const ONBOARD: &[(u32, u32)] = &[
@@ -113,7 +115,7 @@ impl Streams {
         } else if interval_us == 0.0 {
             stream.default_ns
         } else {
-            ((interval_us * 1e3) as u64).max(SHORTEST_NS)
+            ((interval_us.min(LONGEST_US) * 1e3) as u64).max(SHORTEST_NS)
         };
         stream.due_ns = now_ns + stream.interval_ns;
         true
@@ -193,6 +195,11 @@ mod tests {
         assert_eq!(count(&mut streams, 10 * SECOND_NS, 10).get(&32), None);
         assert!(streams.set_interval(32, 0.0, 20 * SECOND_NS));
         assert_eq!(count(&mut streams, 20 * SECOND_NS, 10).get(&32), Some(&300));
+        for never in [1e30, f64::INFINITY] {
+            assert!(streams.set_interval(32, never, 30 * SECOND_NS));
+            assert_eq!(count(&mut streams, 30 * SECOND_NS, 10).get(&32), None);
+            assert_eq!(streams.interval_us(32), Some(i32::MAX));
+        }
         assert!(!streams.set_interval(12_345, 1e6, 0));
         assert!(streams.request(148) && !streams.request(12_345));
         assert_eq!(streams.take_requested(), [148]);

@@ -95,6 +95,7 @@ pub struct Vehicle {
     gust_mps: DVec3,
     ticks: u64,
     resets_done: usize,
+    system_id: u8,
 }
 
 /// A parameter of the configuration that the vehicle does not take.
@@ -131,7 +132,6 @@ impl Vehicle {
         let mut estimator = Estimator::new(config.estimator, config.seed);
         let estimate = estimator.step(&body, TICK_S / f64::from(SUBSTEPS));
         Ok(Self {
-            params,
             autopilot: Autopilot::default(),
             gimbal: Gimbal::default(),
             battery: Battery::new(config.battery),
@@ -143,6 +143,8 @@ impl Vehicle {
             gust_mps: DVec3::ZERO,
             ticks: 0,
             resets_done: 0,
+            system_id: u8::try_from(params.int(Param::MAV_SYS_ID)).unwrap_or(1).max(1),
+            params,
             config,
         })
     }
@@ -271,9 +273,9 @@ impl Vehicle {
         )
     }
 
-    /// MAV_SYS_ID.
+    /// MAV_SYS_ID as it was at the start: a new value counts from the next one, as on PX4.
     #[must_use]
     pub fn system_id(&self) -> u8 {
-        u8::try_from(self.params.int(Param::MAV_SYS_ID)).unwrap_or(1).max(1)
+        self.system_id
     }
 }

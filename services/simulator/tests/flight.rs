@@ -350,6 +350,22 @@ fn parameters_are_read_set_and_listed() {
 }
 
 #[test]
+fn a_new_system_id_counts_from_the_next_start() {
+    let mut c = Client::with(&[]);
+    let id = mavlink::types::CharArray::from("MAV_SYS_ID");
+    c.send(&MavMessage::PARAM_SET(PARAM_SET_DATA {
+        param_value: f32::from_bits(9),
+        target_system: 1,
+        target_component: 1,
+        param_id: id,
+        param_type: MavParamType::MAV_PARAM_TYPE_INT32,
+    }));
+    c.run(0.1);
+    assert_eq!(c.simulator.vehicle().params.int(Param::MAV_SYS_ID), 9);
+    assert_eq!(c.command(512, &[148.0]), Some(ACCEPTED), "still addressed as before");
+}
+
+#[test]
 fn timesync_is_answered_with_the_vehicles_time() {
     let mut c = Client::with(&[]);
     c.heard.clear();

@@ -20,7 +20,8 @@ payload! {
         pub incarnation: u64,
         /// Of requests and replies: the request's id.
         pub request_id: u64,
-        /// Of requests and replies: which life of the client asked (ids of short-lived commands may repeat).
+        /// Of requests and replies: which life of the client asked, or which mission (ids of short-lived commands and of
+        /// missions may repeat).
         pub client_incarnation: u64,
         /// [`crate::ServiceName`] code of the sender.
         pub sender: u32,

@@ -20,7 +20,8 @@ const RESEND_AFTER: Duration = Duration::from_millis(500);
 pub struct ReplyAddress {
     /// [`ServiceName`] code of the client.
     pub client: u32,
-    /// Which life of the client asked; 0 for services, whose ids are unique over restarts.
+    /// Which life of the client asked, or which mission: ids of the planner count within a mission. 0 for other services,
+    /// whose ids are unique over restarts.
     pub client_incarnation: u64,
     /// The request's id.
     pub request_id: u64,
@@ -77,6 +78,11 @@ impl<R: RequestChannel> Client<R> {
         // Ids of services come from journals and are unique over restarts; those of commands are not.
         let incarnation = if sender == ServiceName::Command { u64::from(std::process::id()) } else { 0 };
         Self { requests, replies, sender, incarnation, kept: BTreeMap::new() }
+    }
+
+    /// Says which mission the ids count in: those of a journal begin anew with every mission, in a system that stays up.
+    pub fn count_within(&mut self, mission: u64) {
+        self.incarnation = mission;
     }
 
     /// Sends a request and keeps it until [`Self::finish`]. The id is unique over the client's restarts.

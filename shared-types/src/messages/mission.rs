@@ -2,6 +2,13 @@
 
 use crate::{codes, payload};
 
+/// A number for a mission, by its id and folder: what ids that count within a mission are told apart by (FNV-1a; never 0).
+#[must_use]
+pub fn mission_key(id: &str, folder: &str) -> u64 {
+    let bytes = id.bytes().chain([0]).chain(folder.bytes());
+    bytes.fold(0xcbf2_9ce4_8422_2325u64, |hash, byte| (hash ^ u64::from(byte)).wrapping_mul(0x0100_0000_01b3)).max(1)
+}
+
 codes! {
     /// The phases of Algorithm 1, and what surrounds them.
     pub enum MissionPhase {

@@ -14,7 +14,7 @@ pub use clock::{ClockGrant, ClockTick, MAX_SERVICES};
 pub use health::{ControlCommand, ControlReply, ControlRequest, Health, ServiceState};
 pub use mission::{
     CandidateState, CandidateStatus, EndReason, MissionCommand, MissionPhase, MissionReply, MissionRequest,
-    MissionState,
+    MissionState, mission_key,
 };
 pub use model::{GaussianRow, RoundReply, RoundRequest, RoundStatus, SnapshotHeader};
 pub use scorer::{CandidateScore, CandidateView, ScoreReply, ScoreRequest, ScoreStatus, VarianceMode};

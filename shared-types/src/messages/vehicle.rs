@@ -169,9 +169,11 @@ codes! {
 payload! {
     /// `vehicle/target`: a path to fly. The items are `path_len` waypoints of the path, then `return_len` waypoints of the
     /// checked way back from its end to above the landing point.
-    pub struct VehicleTarget [64] {
-        /// Increases with every target of a mission; never used twice.
+    pub struct VehicleTarget [72] {
+        /// Increases with every target of a mission; never used twice in it.
         pub id: u64,
+        /// [`super::mission::mission_key`] of the mission that the id counts in.
+        pub mission: u64,
         /// Lowest corner of the volume that no setpoint leaves, metres.
         pub volume_min_m: [f64; 3],
         /// Highest corner of that volume, metres.

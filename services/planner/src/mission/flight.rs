@@ -4,7 +4,7 @@ use glam::DVec3;
 use shared_types::config::planner::{BatchOrder, Transit};
 use shared_types::messages::{
     CaptureRequest, CaptureStatus, Commander, EndReason, FlightMode, TargetStatus, VehicleState, VehicleTarget,
-    Waypoint,
+    Waypoint, mission_key,
 };
 use shared_types::ns_from_s;
 use shared_types::payload::unpack_text;
@@ -243,6 +243,7 @@ impl Mission {
         #[expect(clippy::cast_possible_truncation, reason = "at most a few hundred waypoints")]
         let target = VehicleTarget {
             id,
+            mission: mission_key(&self.setup.mission_id, &self.setup.folder),
             volume_min_m: volume.min_m.to_array(),
             volume_max_m: volume.max_m.to_array(),
             path_len: there as u32,

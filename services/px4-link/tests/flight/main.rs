@@ -2,189 +2,23 @@
 
 #![expect(clippy::expect_used, reason = "a test that cannot be set up has failed")]
 
-use std::collections::BTreeMap;
+mod hands;
+mod rig;
+mod silence;
 
 use glam::DVec3;
 use px4_link::commands::set_mode;
-use px4_link::logic::{Core, command_long, setpoint_message};
+use px4_link::logic::command_long;
 use px4_link::mavlink_io::{decode, encode};
-use px4_link::path::{Point, waypoint};
 use px4_link::state::Phase;
-use px4_link::store::Store;
-use px4_link::stream::{Settings, Streamer};
-use shared_types::TICK_NS;
+use rig::{Rig, at, rig};
 use shared_types::bus::ReplyAddress;
 use shared_types::config::LinkConfig;
 use shared_types::messages::{
-    CommandReply, CommandRequest, CommandStatus, Commander, FlightMode, TargetStatus, VehicleCommand, VehicleState,
-    VehicleTarget, Waypoint,
+    CommandRequest, CommandStatus, Commander, FlightMode, TargetStatus, VehicleCommand, VehicleTarget, Waypoint,
 };
-use shared_types::payload::unpack_text;
-use simulator::simulator::{LinkId, Simulator};
+use simulator::simulator::LinkId;
 use simulator::vehicle::VehicleConfig;
-
-struct Rig {
-    config: LinkConfig,
-    folder: tempfile::TempDir,
-    simulator: Simulator,
-    core: Core,
-    streamer: Streamer,
-    pending: Vec<Vec<u8>>,
-    now_ns: u64,
-    planner: bool,
-    requests: u64,
-    replies: BTreeMap<u64, CommandReply>,
-    path: Vec<DVec3>,
-}
-
-impl Rig {
-    fn new(config: LinkConfig, vehicle: VehicleConfig) -> Self {
-        let folder = tempfile::tempdir().expect("a folder");
-        Self {
-            core: Core::new(&config, true, 1, Store::new(folder.path())),
-            streamer: Streamer::new(Settings::new(&config)),
-            simulator: Simulator::new(vehicle, 0).expect("good parameters"),
-            config,
-            folder,
-            pending: Vec::new(),
-            now_ns: 0,
-            planner: true,
-            requests: 0,
-            replies: BTreeMap::new(),
-            path: Vec::new(),
-        }
-    }
-
-    /// One tick of 10 ms. Without a link the datagrams are lost.
-    fn tick(&mut self, with_link: bool) {
-        self.now_ns += TICK_NS;
-        for datagram in core::mem::take(&mut self.pending) {
-            self.simulator.receive(LinkId::Onboard, &datagram, 0);
-        }
-        self.simulator.step();
-        let datagrams = self.simulator.take_datagrams();
-        self.path.push(self.simulator.truth().position_m);
-        if !with_link {
-            return;
-        }
-        for received in
-            datagrams.iter().filter(|(link, _)| *link == LinkId::Onboard).flat_map(|(_, bytes)| decode(bytes))
-        {
-            self.core.on_message(self.now_ns, &received);
-        }
-        self.core.on_report(self.streamer.report());
-        if self.planner && self.now_ns.is_multiple_of(100_000_000) {
-            self.core.on_alive(self.now_ns - TICK_NS);
-        }
-        let outputs = self.core.step(self.now_ns);
-        self.pending.extend(outputs.messages.iter().map(|message| encode(1, 0, message)));
-        outputs.orders.into_iter().for_each(|order| self.streamer.order(order));
-        if let Some(to_send) = self.streamer.step(self.now_ns) {
-            self.pending.push(encode(1, 0, &setpoint_message(1, self.now_ns, &to_send)));
-        }
-        self.core.on_report(self.streamer.report());
-        self.replies.extend(outputs.replies.iter().map(|(to, reply)| (to.request_id, *reply)));
-    }
-
-    fn state(&self) -> VehicleState {
-        self.core.state(self.now_ns)
-    }
-
-    /// Ticks until something holds.
-    fn until(&mut self, what: &str, limit_s: u64, holds: impl Fn(&Self) -> bool) {
-        let end_ns = self.now_ns + limit_s * 1_000_000_000;
-        while !holds(self) {
-            assert!(
-                self.now_ns < end_ns,
-                "not within {limit_s} s: {what}; {:?} {:#?}",
-                self.core.phase(),
-                self.state()
-            );
-            self.tick(true);
-        }
-    }
-
-    fn seconds(&mut self, seconds: u64) {
-        (0..seconds * 100).for_each(|_| self.tick(true));
-    }
-
-    fn request(&mut self, command: VehicleCommand) -> u64 {
-        self.requests += 1;
-        let address =
-            ReplyAddress { client: 8, client_incarnation: 0, request_id: self.requests, sent_ns: self.now_ns };
-        self.core.on_command(
-            self.now_ns,
-            address,
-            &CommandRequest { command: command.code(), altitude_m: 2.5, reserved: 0 },
-        );
-        self.requests
-    }
-
-    fn status(&self, id: u64) -> (Option<CommandStatus>, String) {
-        let reply = self.replies.get(&id).copied().unwrap_or_default();
-        (CommandStatus::from_code(reply.status), unpack_text(&reply.reason))
-    }
-
-    fn command(&mut self, command: VehicleCommand, limit_s: u64) {
-        let id = self.request(command);
-        self.until(&format!("{command} confirmed"), limit_s, |rig| rig.status(id).0 == Some(CommandStatus::Confirmed));
-    }
-
-    fn take_off(&mut self) {
-        self.until("ready", 60, |rig| rig.state().ready == 1 && rig.state().armable == 1);
-        self.command(VehicleCommand::Arm, 10);
-        self.command(VehicleCommand::Takeoff, 30);
-        self.command(VehicleCommand::TakeControl, 10);
-        assert_eq!((self.state().mode, self.core.phase()), (FlightMode::Offboard.code(), Phase::Offboard));
-    }
-
-    /// Sends a target whose path begins at the present setpoint and whose way back is the same way.
-    fn target(&mut self, id: u64, points: &[Waypoint]) {
-        let start = Point {
-            position_m: DVec3::from_array(self.state().setpoint_position_m),
-            yaw_rad: self.state().setpoint_yaw_rad,
-            pitch_rad: 0.0,
-        };
-        let mut all = vec![waypoint(&start, 1.0)];
-        all.extend_from_slice(points);
-        let path_len = all.len() as u32;
-        let back: Vec<Waypoint> = all.iter().rev().copied().collect();
-        let return_len = back.len() as u32;
-        all.extend(back);
-        let header = VehicleTarget {
-            id,
-            volume_min_m: [-20.0, -20.0, 0.3],
-            volume_max_m: [20.0, 20.0, 12.0],
-            path_len,
-            return_len,
-        };
-        self.core.on_target(&header, &all);
-    }
-
-    /// px4-link is killed and started again after a while.
-    fn restart(&mut self, away_ticks: u32) {
-        self.pending.clear();
-        (0..away_ticks).for_each(|_| self.tick(false));
-        self.core = Core::new(&self.config, true, 2, Store::new(self.folder.path()));
-        self.streamer = Streamer::new(Settings::new(&self.config));
-    }
-
-    /// The fastest that the vehicle truly was over the last ticks, m/s.
-    fn fastest(&self, ticks: usize) -> f64 {
-        self.path[self.path.len() - ticks..]
-            .windows(2)
-            .map(|pair| pair[0].distance(pair[1]) * 100.0)
-            .fold(0.0, f64::max)
-    }
-}
-
-fn rig() -> Rig {
-    Rig::new(LinkConfig::default(), VehicleConfig::default())
-}
-
-fn at(x: f64, y: f64, z: f64, yaw: f64, pitch: f64) -> Waypoint {
-    waypoint(&Point { position_m: DVec3::new(x, y, z), yaw_rad: yaw, pitch_rad: pitch }, 1.5)
-}
 
 #[test]
 fn a_whole_flight_twice() {
@@ -250,7 +84,14 @@ fn wrong_targets_are_refused_by_name() {
     assert_eq!(refused(&rig), (6, Some(TargetStatus::RefusedPath)));
     rig.target(7, &[at(f64::NAN, 0.0, 2.0, 0.0, 0.0)]);
     assert_eq!(refused(&rig), (7, Some(TargetStatus::RefusedPath)));
-    let far = VehicleTarget { id: 8, volume_min_m: [-20.0; 3], volume_max_m: [20.0; 3], path_len: 1, return_len: 0 };
+    let far = VehicleTarget {
+        id: 8,
+        mission: 1,
+        volume_min_m: [-20.0; 3],
+        volume_max_m: [20.0; 3],
+        path_len: 1,
+        return_len: 0,
+    };
     rig.core.on_target(&far, &[at(1.5, 0.0, 2.5, 0.0, 0.0)]);
     assert_eq!(refused(&rig), (8, Some(TargetStatus::RefusedStart)));
     rig.seconds(4);
@@ -259,6 +100,10 @@ fn wrong_targets_are_refused_by_name() {
     assert!(before.distance(rig.simulator.truth().position_m) < 0.05);
     rig.target(9, &[at(0.0, 0.0, 2.5, 0.0, 0.0)]);
     assert_eq!(refused(&rig), (9, Some(TargetStatus::Flying)));
+    // The next mission in the same system counts from 1.
+    rig.mission = 2;
+    rig.target(1, &[at(0.5, 0.0, 2.5, 0.0, 0.0)]);
+    assert_eq!(refused(&rig), (1, Some(TargetStatus::Flying)));
 }
 
 #[test]

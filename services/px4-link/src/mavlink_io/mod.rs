@@ -1,24 +1,30 @@
 //! The connection: bytes to messages and back, robust to garbage, pinned to one autopilot.
 //!
 //! UDP has a socket of its own, so that lockstep can take exactly the datagrams that the clock has counted, and count what
-//! it sent. TCP and serial lines (wall mode only) use the `mavlink` crate's connection with a reader thread and a bounded
-//! queue.
+//! it sent. TCP and serial lines (wall mode only) have a reader thread and a bounded queue ([`line`]).
+
+mod codec;
+mod line;
 
 use std::collections::VecDeque;
 use std::net::{SocketAddr, UdpSocket};
 use std::os::fd::{AsFd, BorrowedFd};
 use std::sync::atomic::{AtomicU8, AtomicU64, Ordering};
-use std::sync::mpsc::{Receiver, SyncSender, TryRecvError, sync_channel};
+use std::sync::mpsc::{Receiver, TryRecvError, sync_channel};
 use std::sync::{Arc, OnceLock};
 use std::time::{Duration, Instant};
 
 use mavlink::dialects::common::{MavAutopilot, MavMessage};
-use mavlink::{MAVLinkV2MessageRaw, MavConnection, MavHeader, MavlinkVersion, Message};
+
+pub use codec::{Received, decode, encode};
+use line::Line;
 
 /// The component that px4-link is: MAV_COMP_ID_ONBOARD_COMPUTER.
 pub const OWN_COMPONENT: u8 = 191;
 const QUEUE: usize = 1024;
 const MISSING_LIMIT: Duration = Duration::from_millis(200);
+/// After an absence, what a TCP or serial line still holds of it is read and dropped for this long.
+const STALE_FOR: Duration = Duration::from_millis(300);
 
 /// Why there is no connection.
 #[derive(Debug, thiserror::Error)]
@@ -40,69 +46,9 @@ pub enum LinkError {
     NotCountable(String),
 }
 
-/// A message and who sent it.
-#[derive(Debug, Clone)]
-pub struct Received {
-    /// System id of the sender.
-    pub system: u8,
-    /// Component id of the sender.
-    pub component: u8,
-    /// What it says.
-    pub message: MavMessage,
-}
-
-/// Messages in a piece of bytes. Garbage, torn frames, wrong checksums and unknown messages are skipped.
-#[must_use]
-pub fn decode(mut bytes: &[u8]) -> Vec<Received> {
-    let mut messages = Vec::new();
-    while let Some(start) = bytes.iter().position(|&b| b == mavlink::MAV_STX_V2 || b == mavlink::MAV_STX) {
-        bytes = bytes.get(start..).unwrap_or_default();
-        match frame(bytes) {
-            Some((length, received)) => {
-                messages.extend(received);
-                bytes = bytes.get(length..).unwrap_or_default();
-            }
-            None => bytes = bytes.get(1..).unwrap_or_default(),
-        }
-    }
-    messages
-}
-
-/// A whole frame at the start of the bytes: its length, and its message when we know it.
-fn frame(bytes: &[u8]) -> Option<(usize, Option<Received>)> {
-    let v2 = *bytes.first()? == mavlink::MAV_STX_V2;
-    let payload_len = usize::from(*bytes.get(1)?);
-    let (header_len, system, component, id, signed) = if v2 {
-        let id = u32::from_le_bytes([*bytes.get(7)?, *bytes.get(8)?, *bytes.get(9)?, 0]);
-        (10, *bytes.get(5)?, *bytes.get(6)?, id, bytes.get(2)? & 1 == 1)
-    } else {
-        (6, *bytes.get(3)?, *bytes.get(4)?, u32::from(*bytes.get(5)?), false)
-    };
-    let end = header_len + payload_len;
-    let sum = u16::from_le_bytes([*bytes.get(end)?, *bytes.get(end + 1)?]);
-    if mavlink::calculate_crc(bytes.get(1..end)?, MavMessage::extra_crc(id)) != sum {
-        return None;
-    }
-    let length = end + 2 + if signed { 13 } else { 0 };
-    let version = if v2 { MavlinkVersion::V2 } else { MavlinkVersion::V1 };
-    let message = MavMessage::parse(version, id, bytes.get(header_len..end)?).ok();
-    Some((length, message.map(|message| Received { system, component, message })))
-}
-
-/// A MAVLink 2 frame of a message.
-#[must_use]
-pub fn encode(system: u8, sequence: u8, message: &MavMessage) -> Vec<u8> {
-    let header = MavHeader { system_id: u32::from(system), component_id: OWN_COMPONENT, sequence };
-    let mut raw = MAVLinkV2MessageRaw::new();
-    raw.serialize_message(header, message);
-    raw.raw_bytes().to_vec()
-}
-
-type StreamConnection = mavlink::Connection<MavMessage>;
-
 enum Way {
     Udp(Arc<UdpSocket>),
-    Stream(Arc<OnceLock<StreamConnection>>),
+    Stream(Arc<Line>),
 }
 
 /// The pinned peer.
@@ -157,10 +103,7 @@ impl Sender {
                 };
                 socket.send_to(&encode(system, sequence, message), address).is_ok()
             }
-            Way::Stream(connection) => {
-                let header = MavHeader { system_id: u32::from(system), component_id: OWN_COMPONENT, sequence };
-                connection.get().is_some_and(|connection| connection.send(&header, message).is_ok())
-            }
+            Way::Stream(line) => line.send(&encode(system, sequence, message)),
         };
         if gone {
             self.0.sent.fetch_add(1, Ordering::Relaxed);
@@ -182,6 +125,10 @@ pub struct Link {
     pub foreign: u64,
     /// Whether the clock's count has been taken over since the last (re)join.
     joined: bool,
+    /// What comes until then was sent before this process was back.
+    stale_until: Option<Instant>,
+    /// Was out: what waits tells of the time before.
+    discards: bool,
 }
 
 impl core::fmt::Debug for Link {
@@ -206,13 +153,13 @@ impl Link {
             return Err(LinkError::NotCountable(url.to_owned()));
         } else {
             let (send, receive) = sync_channel(QUEUE);
-            let slot = Arc::new(OnceLock::new());
-            let (url_of_thread, slot_of_thread) = (url.to_owned(), Arc::clone(&slot));
+            let line = Arc::new(Line::default());
+            let (url_of_thread, line_of_thread) = (url.to_owned(), Arc::clone(&line));
             std::thread::Builder::new()
                 .name("link-reader".to_owned())
-                .spawn(move || read_stream(&url_of_thread, &slot_of_thread, &send))
+                .spawn(move || line::read(&url_of_thread, &line_of_thread, &send))
                 .map_err(failed)?;
-            (Way::Stream(slot), None, Some(receive))
+            (Way::Stream(line), None, Some(receive))
         };
         let shared =
             Shared { way, peer: OnceLock::new(), first_address, sequence: AtomicU8::new(0), sent: AtomicU64::new(0) };
@@ -224,6 +171,8 @@ impl Link {
             missing: 0,
             foreign: 0,
             joined: false,
+            stale_until: None,
+            discards: false,
         })
     }
 
@@ -251,11 +200,15 @@ impl Link {
         }
     }
 
-    /// Lockstep: takes the datagrams that the clock has counted. On joining, whatever is there; the count is taken over.
+    /// Lockstep: takes the datagrams that the clock has counted. On joining, whatever is there (and drops it where this
+    /// process was out); the count is taken over.
     /// One that is still missing after 200 ms of wall time is counted and given up.
     pub fn drain_to(&mut self, datagrams: u64) {
         if !self.joined {
             self.take_all();
+            if core::mem::take(&mut self.discards) {
+                self.waiting.clear();
+            }
             self.joined = true;
             self.taken = datagrams;
             return;
@@ -275,10 +228,12 @@ impl Link {
         }
     }
 
-    /// Lockstep: was out. The next drain takes the clock's count over, and drops what came before.
+    /// This process was out or stopped: drops what came before. In lockstep the next drain takes the clock's count over.
     pub fn rejoin(&mut self) {
         self.joined = false;
+        self.discards = true;
         self.waiting.clear();
+        self.stale_until = self.reader.is_some().then(|| Instant::now() + STALE_FOR);
     }
 
     /// Takes everything that has come.
@@ -296,7 +251,10 @@ impl Link {
         if let Some(reader) = &self.reader {
             return match reader.try_recv() {
                 Ok(received) => {
-                    self.accept(None, received);
+                    if self.stale_until.is_none_or(|until| Instant::now() > until) {
+                        self.stale_until = None;
+                        self.accept(None, received);
+                    }
                     true
                 }
                 Err(TryRecvError::Empty | TryRecvError::Disconnected) => false,
@@ -347,112 +305,5 @@ fn bound(address: &str) -> std::io::Result<UdpSocket> {
     Ok(socket)
 }
 
-/// Reads a TCP or serial line for ever; drops messages while the queue is full.
-fn read_stream(url: &str, slot: &OnceLock<StreamConnection>, queue: &SyncSender<Received>) {
-    let again = Duration::from_secs(1);
-    let connection = loop {
-        match mavlink::connect::<MavMessage>(url) {
-            Ok(connection) => break slot.get_or_init(|| connection),
-            Err(error) => {
-                tracing::warn!(url, %error, "cannot reach the autopilot; trying again");
-                std::thread::sleep(again);
-            }
-        }
-    };
-    loop {
-        match connection.recv() {
-            Ok((header, message)) => {
-                let Ok(system) = u8::try_from(header.system_id) else { continue };
-                let received = Received { system, component: header.component_id, message };
-                match queue.try_send(received) {
-                    Err(std::sync::mpsc::TrySendError::Disconnected(_)) => return,
-                    Ok(()) | Err(std::sync::mpsc::TrySendError::Full(_)) => {}
-                }
-            }
-            Err(mavlink::error::MessageReadError::Parse(_)) => {}
-            Err(error) => {
-                tracing::warn!(url, %error, "the line to the autopilot broke");
-                std::thread::sleep(again);
-            }
-        }
-    }
-}
-
 #[cfg(test)]
-mod tests {
-    use mavlink::dialects::common::{HEARTBEAT_DATA, TIMESYNC_DATA};
-    use proptest::prelude::*;
-
-    use super::*;
-
-    fn heartbeat(autopilot: MavAutopilot) -> MavMessage {
-        MavMessage::HEARTBEAT(HEARTBEAT_DATA { autopilot, mavlink_version: 3, ..Default::default() })
-    }
-
-    fn framed(system: u8, component: u8, message: &MavMessage) -> Vec<u8> {
-        let mut raw = MAVLinkV2MessageRaw::new();
-        raw.serialize_message(
-            MavHeader { system_id: u32::from(system), component_id: component, sequence: 0 },
-            message,
-        );
-        raw.raw_bytes().to_vec()
-    }
-
-    proptest! {
-        #[test]
-        fn garbage_never_panics_and_never_hides_a_whole_frame(
-            before in proptest::collection::vec(any::<u8>(), 0..200), after in proptest::collection::vec(any::<u8>(), 0..40), ts in any::<i64>(),
-        ) {
-            // A start byte in the garbage could claim the frame as its own payload; with a right checksum by chance 1:65536.
-            let message = MavMessage::TIMESYNC(TIMESYNC_DATA { tc1: 5, ts1: ts, ..Default::default() });
-            let bytes = [before, encode(1, 9, &message), after].concat();
-            let found = decode(&bytes);
-            prop_assert!(found.iter().any(|received| received.message == message && received.component == OWN_COMPONENT));
-        }
-    }
-
-    #[test]
-    fn only_the_first_autopilot_is_heard() {
-        let mut link = Link::open("udpin:127.0.0.1:0", false).expect("a free port");
-        let to = link.local_address().expect("udp");
-        let socket = |_: u8| UdpSocket::bind("127.0.0.1:0").expect("a free port");
-        let (station, autopilot, other) = (socket(0), socket(1), socket(2));
-        station.send_to(&framed(255, 190, &heartbeat(MavAutopilot::MAV_AUTOPILOT_INVALID)), to).expect("sent");
-        autopilot.send_to(&framed(3, 154, &heartbeat(MavAutopilot::MAV_AUTOPILOT_PX4)), to).expect("sent");
-        link.take_all();
-        assert!(
-            link.sender().peer().is_none()
-                && link.foreign == 2
-                && !link.sender().send(&heartbeat(MavAutopilot::MAV_AUTOPILOT_INVALID))
-        );
-        autopilot.send_to(&framed(3, 1, &heartbeat(MavAutopilot::MAV_AUTOPILOT_PX4)), to).expect("sent");
-        other.send_to(&framed(3, 1, &heartbeat(MavAutopilot::MAV_AUTOPILOT_PX4)), to).expect("sent");
-        link.take_all();
-        assert_eq!(link.sender().peer().map(|peer| peer.system), Some(3));
-        assert!(link.next_message().is_some() && link.next_message().is_none());
-        assert!(link.sender().send(&heartbeat(MavAutopilot::MAV_AUTOPILOT_INVALID)) && link.sender().sent() == 1);
-    }
-
-    #[test]
-    fn in_lockstep_exactly_the_counted_datagrams_are_taken() {
-        let mut link = Link::open("udpin:127.0.0.1:0", true).expect("a free port");
-        let to = link.local_address().expect("udp");
-        let autopilot = UdpSocket::bind("127.0.0.1:0").expect("a free port");
-        let send = |count: usize| {
-            for _ in 0..count {
-                autopilot.send_to(&framed(1, 1, &heartbeat(MavAutopilot::MAV_AUTOPILOT_PX4)), to).expect("sent");
-            }
-        };
-        let drain = |link: &mut Link, to: u64| {
-            link.drain_to(to);
-            core::iter::from_fn(|| link.next_message()).count()
-        };
-        send(2);
-        assert_eq!(drain(&mut link, 40), 2, "joining takes the count over");
-        send(3);
-        assert_eq!(drain(&mut link, 42), 2);
-        assert_eq!(drain(&mut link, 43), 1);
-        assert_eq!((drain(&mut link, 44), link.missing), (0, 1), "a lost one is given up");
-        assert!(matches!(Link::open("tcpout:127.0.0.1:5760", true), Err(LinkError::NotCountable(_))));
-    }
-}
+mod tests;
