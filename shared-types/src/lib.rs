@@ -16,6 +16,7 @@ pub mod config;
 pub mod folder;
 pub mod frames;
 pub mod logging;
+pub mod memory;
 pub mod messages;
 pub mod payload;
 pub mod realtime;

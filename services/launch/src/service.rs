@@ -30,6 +30,7 @@ pub fn run(name: ServiceName, arguments: &Service) -> anyhow::Result<()> {
     {
         tracing::debug!(%error, "the process keeps its name");
     }
+    shared_types::memory::give_back_freed_memory();
     apply_scheduling(name);
     let (system, config, _made) = join(arguments)?;
     if system.version != env!("CARGO_PKG_VERSION") {

@@ -4,9 +4,11 @@ use std::rc::Rc;
 
 use super::*;
 use crate::channel::{
-    AliveChannel, FrameChannel, MissionStateChannel, RoundChannel, SnapshotChannel, VehicleTargetChannel,
+    AliveChannel, FrameChannel, GrantChannel, MissionStateChannel, RoundChannel, SnapshotChannel, VehicleTargetChannel,
 };
-use crate::messages::{Alive, FrameHeader, MissionState, RoundReply, RoundRequest, SnapshotHeader, VehicleTarget};
+use crate::messages::{
+    Alive, ClockGrant, FrameHeader, MissionState, RoundReply, RoundRequest, SnapshotHeader, VehicleTarget,
+};
 
 struct Domain {
     system: System,
@@ -208,4 +210,38 @@ fn what_the_channels_reserve_is_known_before_they_are_opened() {
     let mut all = SendAll { bus: &bus, limits, prefix: &domain.system.prefix, worst: 1.0, ports: Vec::new() };
     crate::channel::visit_all(&mut all);
     assert!(all.worst < 1.3, "{}", all.worst);
+}
+
+#[test]
+fn a_swallowed_wake_up_costs_one_period_and_not_all_that_follow() {
+    let domain = Domain::new();
+    let listener = domain.join(ServiceName::Simulator, false).listener::<GrantChannel>().expect("listener");
+    let sending = std::sync::atomic::AtomicUsize::new(4);
+    let senders = [ServiceName::Planner, ServiceName::Camera, ServiceName::Trainer, ServiceName::Scorer];
+    std::thread::scope(|scope| {
+        for sender in senders {
+            let (domain, sending) = (&domain, &sending);
+            scope.spawn(move || {
+                let mut grants = domain.join(sender, false).publisher::<GrantChannel>().expect("publisher");
+                // Apart, so that nearly every one finds the listener drained and about to sleep.
+                for _ in 0..10_000 {
+                    grants.send(1, 1, &ClockGrant::default()).expect("sent");
+                    std::thread::sleep(std::time::Duration::from_micros(20));
+                }
+                sending.fetch_sub(1, std::sync::atomic::Ordering::SeqCst);
+            });
+        }
+        while sending.load(std::sync::atomic::Ordering::SeqCst) > 0 {
+            wait(&[&listener], &[], std::time::Duration::from_millis(1)).expect("woken");
+        }
+    });
+    let mut grants = domain.join(ServiceName::Px4Link, false).publisher::<GrantChannel>().expect("publisher");
+    // What has come is taken, and a time that is over clears a mark that was left behind.
+    (0..3).for_each(|_| wait(&[&listener], &[], std::time::Duration::from_millis(5)).expect("over"));
+    for _ in 0..20 {
+        grants.send(1, 1, &ClockGrant::default()).expect("sent");
+        let before = std::time::Instant::now();
+        wait(&[&listener], &[], std::time::Duration::from_secs(5)).expect("woken");
+        assert!(before.elapsed() < std::time::Duration::from_secs(4), "woken by the message");
+    }
 }

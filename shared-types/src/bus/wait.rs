@@ -110,7 +110,13 @@ impl Listener {
     }
 }
 
-/// Sleeps until a listener is woken, a descriptor is readable, or the time is over. Listeners are drained.
+/// Sleeps until a listener is woken, a descriptor is readable, or the time is over. Listeners that were woken are drained;
+/// all of them when the time is over.
+///
+/// The latter because iceoryx2 0.10 can swallow wake-ups: a listener that drains resets its "notified" mark and then empties
+/// its socket. A notifier that comes in between has its byte emptied and then sets the mark, and while the mark is set no
+/// notifier sends a byte, for ever (a mission in five ran at a tenth of its speed). Draining clears the mark, so that such
+/// a race costs one timer's period and no more; the message itself is read all the same.
 ///
 /// # Errors
 /// When the operating system refuses to wait; a signal only ends the wait.
@@ -124,12 +130,13 @@ pub fn wait(listeners: &[&Listener], fds: &[BorrowedFd<'_>], timeout: Duration) 
         tv_sec: i64::try_from(timeout.as_secs()).unwrap_or(i64::MAX),
         tv_nsec: i64::from(timeout.subsec_nanos()),
     };
-    match poll(&mut watched, Some(&timeout)) {
-        Ok(_) | Err(rustix::io::Errno::INTR) => {}
+    let ready = match poll(&mut watched, Some(&timeout)) {
+        Ok(ready) => ready,
+        Err(rustix::io::Errno::INTR) => return Ok(()),
         Err(error) => return Err(BusError::Wait { cause: error.to_string() }),
-    }
+    };
     for (listener, polled) in listeners.iter().zip(&watched) {
-        if polled.revents().contains(PollFlags::IN) {
+        if ready == 0 || polled.revents().contains(PollFlags::IN) {
             listener.drain();
         }
     }
