@@ -29,12 +29,26 @@ fn a_mission_lands_with_a_model_and_a_complete_folder_and_leaves_nothing_behind(
     assert_eq!(metrics["mission"]["deterministic"], true);
     assert_eq!(metrics["mission"]["collisions"], 0);
     let number = |a: &str, b: &str| metrics[a][b].as_f64().unwrap_or_else(|| panic!("{a}.{b} in {metrics:#}"));
-    assert!(number("live", "psnr_object_db") > number("live", "psnr_null_db") + 1.0, "{metrics:#}");
+    // Colours of one frame convention and none other: training gains over the points as inserted, and those over one colour.
+    assert!(number("live", "psnr_init_db") > number("live", "psnr_null_db") + 3.0, "{metrics:#}");
+    assert!(number("live", "psnr_object_db") > number("live", "psnr_init_db") + 2.0, "{metrics:#}");
+    assert!(number("geometry", "f_score_1pct") > 0.5, "{metrics:#}");
+    assert!(number("timing", "score_ms_p50") > 0.0, "{metrics:#}");
+    let parts = ["flight_s", "capture_s", "training_s", "scoring_s"].map(|part| number("timing", part));
+    let total: f64 = parts.iter().sum();
+    assert!(total <= number("mission", "mission_s") && total > 0.8 * number("mission", "mission_s"), "{metrics:#}");
     assert!(number("mission", "min_clearance_m") > 0.3, "{metrics:#}");
     assert!(number("coverage", "cov1_feasible") > 0.5, "{metrics:#}");
     for name in ["north", "east", "south", "west"] {
         assert!(folder.join(format!("report/{name}.png")).is_file(), "report/{name}.png");
     }
+
+    // What is over is not flown again.
+    let before = fs::read(folder.join("journal.jsonl")).expect("the journal");
+    let resumed = common::vantage().arg("resume").arg(&folder).arg("--json").output().expect("vantage runs");
+    assert!(resumed.status.success() && String::from_utf8_lossy(&resumed.stderr).contains("is over"));
+    assert_eq!(serde_json::from_slice::<serde_json::Value>(&resumed.stdout).expect("JSON"), metrics);
+    assert_eq!(fs::read(folder.join("journal.jsonl")).expect("the journal"), before);
 }
 
 #[test]

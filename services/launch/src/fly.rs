@@ -19,7 +19,7 @@ use crate::machine_check::{check_disk, check_shared_memory};
 use crate::progress::Progress;
 use crate::supervise::children::Starter;
 use crate::supervise::{self, Flight, Outcome};
-use crate::{evaluate, print, settings, summary};
+use crate::{evaluate, print, say, settings, summary};
 
 /// Flies a new mission.
 ///
@@ -49,7 +49,11 @@ pub fn resume(arguments: &Resume) -> anyhow::Result<Exit> {
     if let Some(speed) = arguments.speed {
         config.clock.speed = speed;
     }
-    if let Some(last_ns) = evaluate::journal::read(&folder.journal_path())?.last_ns {
+    let journal = evaluate::journal::read(&folder.journal_path())?;
+    if let Some(usable) = journal.over {
+        return already_over(&folder, &config, usable, arguments.json);
+    }
+    if let Some(last_ns) = journal.last_ns {
         // A folder's mission clock never goes back.
         config.mission.epoch_ns = last_ns + shared_types::NS_PER_S;
     }
@@ -62,6 +66,23 @@ pub fn resume(arguments: &Resume) -> anyhow::Result<Exit> {
     check_shared_memory(&config)?;
     check_disk(folder.root(), &config)?;
     mission(&folder, &config, &format!("fly-{}", std::process::id()), arguments.json, claim)
+}
+
+/// Nothing of a mission that is over is flown again: its figures are shown, and measured where a kill came before that.
+fn already_over(folder: &MissionFolder, config: &Config, usable: bool, json: bool) -> anyhow::Result<Exit> {
+    say(&format!("the mission in {} is over; `vantage fly` flies a new one", folder.root().display()));
+    if !usable {
+        return Ok(Exit::Failed);
+    }
+    let metrics = match evaluate::read_metrics(folder)? {
+        Some(metrics) => metrics,
+        None => {
+            let metrics = evaluate::measure(folder, config, evaluate::Effort::of(config), None)?;
+            evaluate::write_metrics(folder, &metrics)?;
+            metrics
+        }
+    };
+    print(&if json { evaluate::to_json(&metrics)? } else { summary::table(&metrics, folder.root()) })
 }
 
 /// The configuration of a new mission, complete.
@@ -194,7 +215,7 @@ impl Drop for Owned {
         self.hold = None;
         match self.system.remove_if_dead() {
             Ok(true) => {}
-            Ok(false) => crate::say(&format!(
+            Ok(false) => say(&format!(
                 "system {} is left to its services, which land the vehicle and end; `vantage doctor --clean` removes it then",
                 self.system.name
             )),
@@ -259,7 +280,7 @@ fn finish(
             let text = if json { evaluate::to_json(&metrics)? } else { summary::table(&metrics, folder.root()) };
             print(&text)?;
         }
-        Err(error) => crate::say(&format!("vantage: not measured: {error:#}")),
+        Err(error) => say(&format!("vantage: not measured: {error:#}")),
     }
     verdict(folder, flight)
 }
@@ -369,6 +390,7 @@ mod tests {
             restarts: std::collections::BTreeMap::new(),
             deterministic: None,
             memory: supervise::memory::Memory::default(),
+            score_ms: Vec::new(),
             last_words: Some("mesh a.obj: no triangles".to_owned()),
         };
         let exit = |code, worked| crate::exit::exit_of(&verdict(&folder, &flight(code, worked)).expect_err("broken"));

@@ -36,6 +36,8 @@ pub struct FlightRecord {
     pub restarts: BTreeMap<String, u32>,
     /// Highest memory over all runs, megabytes.
     pub memory: BTreeMap<String, f64>,
+    /// Processor time of each scoring for a candidate, milliseconds, over all runs.
+    pub score_ms: Vec<f64>,
     /// Runs: 1 for a mission that was not cut off.
     pub runs: u32,
 }
@@ -64,6 +66,7 @@ impl FlightRecord {
         for (service, count) in &flight.restarts {
             *self.restarts.entry(service.to_string()).or_default() += count;
         }
+        self.score_ms.extend(&flight.score_ms);
         for (key, megabytes) in flight.memory.megabytes() {
             let peak = self.memory.entry(key).or_default();
             *peak = peak.max(megabytes);
@@ -123,6 +126,7 @@ mod tests {
             restarts: BTreeMap::from([(ServiceName::Scorer, 1)]),
             deterministic: Some(true),
             memory,
+            score_ms: vec![2.5],
             last_words: None,
         }
     }
@@ -137,6 +141,7 @@ mod tests {
         let record = read(&folder).expect("read");
         assert_eq!((record.runs, record.keyframes, record.wall_s), (2, Some(6), Some(4.0)));
         assert_eq!((record.restarts["scorer"], record.memory["trainer_pss_mb"]), (2, 90.0));
+        assert_eq!(record.score_ms, [2.5, 2.5]);
         assert_eq!(record.deterministic, Some(false), "a resumed mission does not repeat");
         assert_eq!(record.end_reason.as_deref(), Some("complete"));
     }

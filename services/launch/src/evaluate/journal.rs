@@ -32,6 +32,8 @@ pub struct Journal {
     pub psnr_train_db: Option<f64>,
     /// How it ended.
     pub end_reason: Option<String>,
+    /// Whether it is over, and if so, whether with a usable model.
+    pub over: Option<bool>,
     /// Stamp of the last whole line.
     pub last_ns: Option<u64>,
 }
@@ -127,7 +129,12 @@ fn summarise(bytes: &[u8]) -> Journal {
                 journal.iterations = entry["total_iterations"].as_u64().and_then(|count| u32::try_from(count).ok());
                 journal.psnr_train_db = entry["psnr_train_db"].as_f64();
             }
-            "ending" | "over" => journal.end_reason = entry["reason"].as_str().map(str::to_owned),
+            "ending" | "over" => {
+                journal.end_reason = entry["reason"].as_str().map(str::to_owned);
+                if event == "over" {
+                    journal.over = Some(entry["usable"].as_bool().unwrap_or(false));
+                }
+            }
             _ => {}
         }
     }
@@ -170,7 +177,7 @@ mod tests {
         assert!(close(journal.scoring_s, 0.4), "{journal:?}");
         assert!(close(journal.rounds_s, 2.5 + 3.0), "{journal:?}");
         assert_eq!((journal.iterations, journal.psnr_train_db), (Some(400), Some(32.5)));
-        assert_eq!(journal.end_reason.as_deref(), Some("complete"));
+        assert_eq!((journal.end_reason.as_deref(), journal.over), (Some("complete"), Some(true)));
         assert_eq!(journal.last_ns, Some(12_500_000_000));
     }
 

@@ -149,7 +149,7 @@ optional_figures! {
         pub training_s: f64,
         /// Waiting for scores, seconds.
         pub scoring_s: f64,
-        /// Median time of a candidate, milliseconds.
+        /// Median over the rounds of the processor time of scoring one candidate, milliseconds.
         pub score_ms_p50: f64,
         /// 95th percentile of that, milliseconds.
         pub score_ms_p95: f64,
@@ -161,6 +161,15 @@ optional_figures! {
 /// The name of a value that is an enum in the configuration, as in its file.
 fn name_of(value: &impl Serialize) -> Option<String> {
     serde_json::to_value(value).ok()?.as_str().map(str::to_owned)
+}
+
+/// The value below which a share of the values lie (nearest rank); `None` of nothing.
+fn percentile(values: &[f64], share: f64) -> Option<f64> {
+    let mut sorted: Vec<f64> = values.iter().copied().filter(|value| value.is_finite()).collect();
+    sorted.sort_by(f64::total_cmp);
+    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a rank within the values")]
+    let rank = (share * sorted.len() as f64).ceil() as usize;
+    sorted.get(rank.saturating_sub(1)).copied()
 }
 
 /// A figure that means something: finite and above zero.
@@ -208,8 +217,9 @@ impl Metrics {
             capture_s: journal.capture_s,
             training_s: journal.training_s,
             scoring_s: journal.scoring_s,
+            score_ms_p50: percentile(&flight.score_ms, 0.5),
+            score_ms_p95: percentile(&flight.score_ms, 0.95),
             iterations_per_s: journal.iterations.zip(journal.rounds_s).and_then(|(count, time)| rate(count, time)),
-            ..Timing::default()
         };
         Self { mission, live, coverage, geometry: Geometry::default(), timing, memory: flight.memory.clone() }
     }
@@ -267,6 +277,13 @@ mod tests {
         assert_eq!(json["live"], serde_json::json!({}));
         assert_eq!(json["timing"], serde_json::json!({}));
         assert_eq!(serde_json::from_value::<Metrics>(json).expect("read back"), metrics);
+    }
+
+    #[test]
+    fn percentiles_are_by_nearest_rank() {
+        let values: Vec<f64> = (1..=20).rev().map(f64::from).collect();
+        assert_eq!((percentile(&values, 0.5), percentile(&values, 0.95)), (Some(10.0), Some(19.0)));
+        assert_eq!((percentile(&[7.0], 0.95), percentile(&[], 0.5)), (Some(7.0), None));
     }
 
     #[test]

@@ -154,6 +154,18 @@ pub fn to_json(metrics: &Metrics) -> anyhow::Result<String> {
     Ok(serde_json::to_string_pretty(metrics).context("metrics")? + "\n")
 }
 
+/// Reads `report/metrics.json`; `None` when there is none that can be read.
+///
+/// # Errors
+/// When the file is there and the disk refuses it.
+pub fn read_metrics(folder: &MissionFolder) -> anyhow::Result<Option<Metrics>> {
+    match std::fs::read(folder.report_path().join("metrics.json")) {
+        Ok(bytes) => Ok(serde_json::from_slice(&bytes).ok()),
+        Err(error) if error.kind() == std::io::ErrorKind::NotFound => Ok(None),
+        Err(error) => Err(error).context("report/metrics.json"),
+    }
+}
+
 /// Writes `report/metrics.json`.
 ///
 /// # Errors

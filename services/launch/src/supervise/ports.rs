@@ -3,12 +3,13 @@
 use shared_types::ServiceName;
 use shared_types::bus::{Bus, BusError, Client, Limits, Subscriber};
 use shared_types::channel::{
-    ClockChannel, HealthChannel, MissionCommandChannel, MissionStateChannel, TruthChannel, VehicleCommandChannel,
-    VehicleStateChannel,
+    ClockChannel, HealthChannel, MissionCommandChannel, MissionStateChannel, ScoreReplies, TruthChannel,
+    VehicleCommandChannel, VehicleStateChannel,
 };
 use shared_types::config::{ClockMode, Config};
 use shared_types::messages::{
-    ClockTick, CommandRequest, MissionCommand, MissionRequest, MissionState, Truth, VehicleCommand, VehicleState,
+    ClockTick, CommandRequest, MissionCommand, MissionRequest, MissionState, ScoreStatus, Truth, VehicleCommand,
+    VehicleState,
 };
 use shared_types::system::System;
 
@@ -25,6 +26,8 @@ pub struct Heard {
     pub vehicle: Option<VehicleState>,
     /// Where the simulated vehicle truly is, tick by tick.
     pub truths: Vec<Truth>,
+    /// Processor time of each scoring for a candidate, milliseconds.
+    pub score_ms: Vec<f64>,
 }
 
 /// The supervisor's ends of the channels.
@@ -34,6 +37,9 @@ pub struct Ports {
     missions: Subscriber<MissionStateChannel>,
     vehicles: Subscriber<VehicleStateChannel>,
     truths: Subscriber<TruthChannel>,
+    scores: Subscriber<ScoreReplies>,
+    /// The last request whose scoring was counted: answers may come twice.
+    scored: Option<u64>,
     clock: Subscriber<ClockChannel>,
     mission_commands: Client<MissionCommandChannel>,
     vehicle_commands: Client<VehicleCommandChannel>,
@@ -61,6 +67,8 @@ impl Ports {
             missions: bus.subscriber()?,
             vehicles: bus.subscriber()?,
             truths: bus.subscriber()?,
+            scores: bus.subscriber()?,
+            scored: None,
             clock: bus.subscriber()?,
             mission_commands: bus.client()?,
             vehicle_commands: bus.client()?,
@@ -91,6 +99,14 @@ impl Ports {
         heard.vehicle = self.vehicles.latest(now_ns)?.map(|message| *message.header());
         while let Some(message) = self.truths.receive(now_ns)? {
             heard.truths.push(*message.header());
+        }
+        while let Some(reply) = self.scores.receive(now_ns)? {
+            let (id, header) = (reply.request_id(), reply.header());
+            let done = header.status == ScoreStatus::Done.code() && header.candidates > 0;
+            if done && self.scored.replace(id) != Some(id) {
+                #[expect(clippy::cast_precision_loss, reason = "seconds in nanoseconds")]
+                heard.score_ms.push(header.cpu_ns as f64 / 1e6 / f64::from(header.candidates));
+            }
         }
         while let Some(reply) = self.mission_commands.receive(now_ns)? {
             let id = reply.request_id();

@@ -44,6 +44,8 @@ pub struct Flight {
     pub deterministic: Option<bool>,
     /// Memory in flight.
     pub memory: Memory,
+    /// Processor time of each scoring for a candidate, milliseconds.
+    pub score_ms: Vec<f64>,
     /// For a broken run: what the service said last.
     pub last_words: Option<String>,
 }
@@ -91,6 +93,7 @@ pub fn run(system: &System, config: &Config, starter: Starter, progress: &mut Pr
         last_words: None,
         armed: false,
         track: Track::default(),
+        score_ms: Vec::new(),
         at_the_end: None,
     };
     run.event(&Event::Begin);
@@ -134,6 +137,7 @@ struct Run<'a> {
     last_words: Option<String>,
     armed: bool,
     track: Track,
+    score_ms: Vec<f64>,
     /// Outs of the clock and restarts when the mission was over: what happens while everybody leaves is not its doing.
     at_the_end: Option<(Option<u32>, BTreeMap<ServiceName, u32>)>,
 }
@@ -147,6 +151,7 @@ impl Run<'_> {
         for (stamp_ns, state) in heard.missions {
             self.mission(stamp_ns, &state);
         }
+        self.score_ms.extend(heard.score_ms);
         for truth in &heard.truths {
             self.track.note(truth);
         }
@@ -241,6 +246,7 @@ impl Run<'_> {
             restarts,
             deterministic,
             memory: self.memory,
+            score_ms: self.score_ms,
             last_words: self.last_words,
         }
     }
