@@ -107,6 +107,7 @@ fn configure(arguments: &Fly) -> anyhow::Result<Config> {
         });
     }
     let mut config = load(&layers)?;
+    check_camera(&config)?;
     check_object(&config)?;
     config.mission.preset.clone_from(&arguments.settings.preset);
     config.mission.version = env!("CARGO_PKG_VERSION").to_owned();
@@ -132,6 +133,18 @@ fn configure(arguments: &Fly) -> anyhow::Result<Config> {
         return Err(Refusal::usage(problem));
     }
     Ok(config)
+}
+
+/// Refuses a vehicle that nothing here can see with: it would take off, take no view and land.
+fn check_camera(config: &Config) -> anyhow::Result<()> {
+    if config.link.is_local() {
+        return Ok(());
+    }
+    Err(Refusal::missing(format!(
+        "link.url = {}: expected the embedded simulator (127.0.0.1): the only source of images is the simulator's world; \
+         `vantage px4-link --set link.url={}` speaks with the vehicle alone",
+        config.link.url, config.link.url
+    )))
 }
 
 /// Refuses an object that the world could not show or the prior could not hold, before anything is made.
@@ -372,6 +385,8 @@ mod tests {
         }
         let error = configure(&arguments("vantage fly --set world.size_m=3.9")).expect_err("too large");
         assert!(error.to_string().contains("planner.box_max_m"), "{error}");
+        let error = configure(&arguments("vantage fly --set link.url=udpin:0.0.0.0:14540")).expect_err("no camera");
+        assert_eq!(crate::exit::exit_of(&error), Exit::Missing);
         let error = configure(&arguments("vantage fly --speed -3")).expect_err("negative");
         assert!(
             error.downcast_ref::<ConfigError>().is_some_and(|e| e.to_string().starts_with("--speed -3: clock.speed"))

@@ -89,7 +89,7 @@ impl Mission {
     }
 
     /// What was taken while nobody listened is on disk all the same.
-    fn recover_captured(&mut self, views: &mut dyn Views) {
+    pub(super) fn recover_captured(&mut self, views: &mut dyn Views) {
         let asked: Vec<Shot> =
             self.ledger.left().filter(|shot| self.ledger.captures.contains_key(&shot.keyframe_id)).copied().collect();
         for shot in asked {

@@ -235,7 +235,7 @@ impl Mission {
             State::Landing => self.landing(),
             State::Suspended(hold) => self.suspended(hold),
             State::GoingOn => self.going_on(),
-            State::Finishing => self.finishing(),
+            State::Finishing => self.finishing(views),
             State::Over => State::Over,
         }
     }

@@ -7,6 +7,7 @@ use shared_types::messages::{
 use shared_types::ns_from_s;
 
 use super::Mission;
+use crate::io::Views;
 use crate::journal::Record;
 use crate::logic::depth::DepthView;
 use crate::state::State;
@@ -223,12 +224,14 @@ impl Mission {
         State::Landing
     }
 
-    pub(super) fn finishing(&mut self) -> State {
+    pub(super) fn finishing(&mut self, views: &mut dyn Views) -> State {
         if self.recalled {
             tracing::info!("on the ground; the mission is open");
             return State::Over;
         }
         if self.ledger.airborne.is_some() && !self.ledger.landed && self.on_ground() {
+            // The view that was being taken when the mission ended may have been stored since.
+            self.recover_captured(views);
             self.record(Record::Landed);
         }
         let waiting = self.ledger.training().is_some() || self.round_due().is_some();
