@@ -128,8 +128,10 @@ proptest! {
 
 #[test]
 fn a_straight_leg_takes_about_as_long_as_it_must() {
+    let config = LinkConfig { speed_mps: 2.0, acceleration_mps2: 1.5, jerk_mps3: 4.0, ..LinkConfig::default() };
+    let limits = Limits::new(&config);
     let time = |metres: f64| {
-        plan(&Path::new(Point::default(), &[to(metres, 0.0, 0.0, 0.0, 9.0)], &limits()), &limits()).duration_s
+        plan(&Path::new(Point::default(), &[to(metres, 0.0, 0.0, 0.0, 9.0)], &limits), &limits).duration_s
     };
     // 10 m at 2 m/s, 1.5 m/s2, 4 m/s3 cannot be flown below 5 + 1.33 + 0.375 s.
     assert!((6.7..7.3).contains(&time(10.0)), "{}", time(10.0));
