@@ -26,7 +26,9 @@ use ports::Ports;
 use roster::Roster;
 
 const JANITOR_PERIOD: Duration = Duration::from_millis(200);
-const REAPER_PERIOD: Duration = Duration::from_millis(50);
+/// How long the ports of a dead process may stay taken. Whoever opens a port cleans up as well, so a restart does not wait
+/// for it; each look costs about a millisecond.
+const REAPER_PERIOD: Duration = Duration::from_millis(200);
 
 /// Begins to remove what was left half-made. Before anything else: joining the bus itself waits for ever on such a file,
 /// and there is nobody but the keeper to remove it.
