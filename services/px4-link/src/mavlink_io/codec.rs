@@ -23,7 +23,7 @@ pub struct Received {
 #[must_use]
 pub fn decode(mut bytes: &[u8]) -> Vec<Received> {
     let mut messages = Vec::new();
-    while let Some(start) = bytes.iter().position(|&b| b == mavlink::MAV_STX_V2 || b == mavlink::MAV_STX) {
+    while let Some(start) = bytes.iter().position(|&byte| is_start(byte)) {
         bytes = bytes.get(start..).unwrap_or_default();
         match frame(bytes) {
             Some((length, received)) => {
@@ -34,6 +34,11 @@ pub fn decode(mut bytes: &[u8]) -> Vec<Received> {
         }
     }
     messages
+}
+
+/// Whether a frame of MAVLink 1 or 2 may begin with this byte.
+fn is_start(byte: u8) -> bool {
+    byte == mavlink::MAV_STX_V2 || byte == mavlink::MAV_STX
 }
 
 /// A whole frame at the start of the bytes: its length, and its message when we know it.
@@ -48,7 +53,9 @@ fn frame(bytes: &[u8]) -> Option<(usize, Option<Received>)> {
     };
     let end = header_len + payload_len;
     let sum = u16::from_le_bytes([*bytes.get(end)?, *bytes.get(end + 1)?]);
-    if mavlink::calculate_crc(bytes.get(1..end)?, MavMessage::extra_crc(id)) != sum {
+    // The checksum covers a number that belongs to the message's definition; without one (0) nothing can be checked.
+    let extra = MavMessage::extra_crc(id);
+    if extra == 0 || mavlink::calculate_crc(bytes.get(1..end)?, extra) != sum {
         return None;
     }
     let length = end + 2 + if signed { 13 } else { 0 };
@@ -62,7 +69,7 @@ pub(super) fn take_frames(bytes: &mut Vec<u8>) -> Vec<Received> {
     let mut messages = Vec::new();
     let mut at = 0;
     while let Some(rest) = bytes.get(at..) {
-        let Some(start) = rest.iter().position(|&b| b == mavlink::MAV_STX_V2 || b == mavlink::MAV_STX) else {
+        let Some(start) = rest.iter().position(|&byte| is_start(byte)) else {
             at = bytes.len();
             break;
         };
@@ -103,13 +110,17 @@ mod tests {
         fn garbage_never_panics_and_never_hides_a_whole_frame(
             before in proptest::collection::vec(any::<u8>(), 0..200), after in proptest::collection::vec(any::<u8>(), 0..40), ts in any::<i64>(),
         ) {
-            // A start byte in the garbage could claim the frame as its own payload; with a right checksum by chance 1:65536.
             let message = MavMessage::TIMESYNC(TIMESYNC_DATA { tc1: 5, ts1: ts, ..Default::default() });
-            let bytes = [before, encode(1, 9, &message), after].concat();
+            let garbage = before.len();
+            let bytes = [before, encode(1, 9, &message), after, vec![0; 280]].concat();
+            // A start byte in the garbage that claims the frame as its payload has a right checksum once in 65,536 times,
+            // and then nothing tells it from a frame. That is rare enough to fail a build a year, so those cases are left out.
+            let claimed = (0..garbage).any(|start| is_start(bytes[start]) && frame(&bytes[start..]).is_some());
+            prop_assume!(!claimed);
             let found = decode(&bytes);
             let mut parts = Vec::new();
             let mut line = Vec::new();
-            for part in bytes.chunks(7).chain([[0; 280].as_slice()]) {
+            for part in bytes.chunks(7) {
                 line.extend_from_slice(part);
                 parts.extend(take_frames(&mut line));
             }
