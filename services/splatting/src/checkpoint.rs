@@ -133,7 +133,8 @@ fn read_content(reader: &mut Reader<'_>, count: usize, states: usize) -> Option<
     let blocks = reader.blocks(count)?;
     let first = reader.blocks(states)?;
     let second = reader.blocks(states)?;
-    Some((Gaussians::from_parts(blocks, ids, birth_rounds), Optimiser { first, second, steps }))
+    let gaussians = Gaussians::from_parts(blocks, (0, Vec::new()), ids, birth_rounds);
+    Some((gaussians, Optimiser { first, second, steps, ..Optimiser::new() }))
 }
 
 /// Bytes of a checkpoint; saturates, so that no count in a damaged header overflows.

@@ -1,9 +1,9 @@
 //! The Gaussian model: what a round trains and every renderer draws.
 //!
 //! Storage is blocks of 16 Gaussians by 14 rows (AoSoA): one 64-byte row holds one parameter of 16 Gaussians, which is
-//! what a 16-lane projection or Adam step loads, and a block is contiguous, which is what the cache wants. Higher
-//! spherical-harmonics bands would be further blocks beside these; live training uses degree 0 (degree 1 brought
-//! nothing measurable), so only the degree travels.
+//! what a 16-lane projection or Adam step loads, and a block is contiguous, which is what the cache wants. The higher
+//! spherical-harmonics bands are rows of their own beside these, none at degree 0: live training uses degree 0 (degree 1
+//! brought nothing measurable), offline training up to 3.
 
 use glam::{Quat, Vec3};
 
@@ -13,6 +13,21 @@ pub const LANES: usize = 16;
 pub const ROWS: usize = 14;
 /// Value of the degree-0 spherical-harmonics basis function: colour = 0.5 + SH_C0 * sh.
 pub const SH_C0: f32 = 0.282_094_79;
+
+/// Highest supported degree of spherical harmonics.
+pub const SH_DEGREE_MAX: u8 = 3;
+/// Coefficients per channel above degree 0 at [`SH_DEGREE_MAX`].
+pub const SH_REST_MAX: usize = 15;
+
+/// Coefficients per channel above degree 0: (degree + 1)² - 1.
+pub const fn sh_rest_coefficients(degree: u8) -> usize {
+    (degree as usize + 1) * (degree as usize + 1) - 1
+}
+
+/// Rows of a block's higher bands: red, green, blue of each coefficient in turn.
+pub(crate) const fn sh_rest_rows(degree: u8) -> usize {
+    3 * sh_rest_coefficients(degree)
+}
 
 pub(crate) const ROW_MEAN: usize = 0;
 pub(crate) const ROW_LOG_SCALE: usize = 3;
@@ -99,14 +114,27 @@ impl Gaussian {
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Gaussians {
     blocks: Vec<Block>,
+    /// [`sh_rest_rows`] of each block in turn.
+    rest: Vec<Lanes>,
+    sh_degree: u8,
     ids: Vec<u64>,
     birth_rounds: Vec<u32>,
 }
 
 impl Gaussians {
-    /// An empty model.
+    /// An empty model of degree 0.
     pub fn new() -> Self {
         Self::default()
+    }
+
+    /// An empty model whose colours depend on the direction by spherical harmonics up to `degree`.
+    ///
+    /// # Panics
+    /// Where `degree` is above [`SH_DEGREE_MAX`].
+    pub fn with_sh_degree(degree: u8) -> Self {
+        let mut model = Self::new();
+        model.set_sh_degree(degree);
+        model
     }
 
     /// Number of Gaussians.
@@ -119,9 +147,46 @@ impl Gaussians {
         self.ids.is_empty()
     }
 
-    /// Spherical-harmonics degree of the colours. Degree 0 is what training uses; files and channels name it.
+    /// Spherical-harmonics degree of the colours: 0 in live training, up to [`SH_DEGREE_MAX`] offline.
     pub fn sh_degree(&self) -> u8 {
-        0
+        self.sh_degree
+    }
+
+    /// Changes the degree: coefficients of new bands are 0, those of dropped bands are lost.
+    ///
+    /// # Panics
+    /// Where `degree` is above [`SH_DEGREE_MAX`].
+    pub fn set_sh_degree(&mut self, degree: u8) {
+        assert!(degree <= SH_DEGREE_MAX, "spherical harmonics of degree {degree}, above {SH_DEGREE_MAX}");
+        self.rest = resize_rows(&self.rest, sh_rest_rows(self.sh_degree), sh_rest_rows(degree), self.blocks.len());
+        self.sh_degree = degree;
+    }
+
+    /// Coefficients above degree 0 of the Gaussian at `index`, each red, green, blue: bands in order, and within band l
+    /// the orders m from -l to l. Zero above the model's degree.
+    ///
+    /// # Panics
+    /// Where `index >= len()`, as a slice does.
+    pub fn sh_rest(&self, index: usize) -> [[f32; 3]; SH_REST_MAX] {
+        assert!(index < self.len(), "Gaussian {index} of {}", self.len());
+        let mut out = [[0.0; 3]; SH_REST_MAX];
+        for (row, lanes) in self.rest_rows(index / LANES).iter().enumerate() {
+            out[row / 3][row % 3] = lanes.0[index % LANES];
+        }
+        out
+    }
+
+    /// Replaces the coefficients above degree 0; what is beyond the model's degree is left out.
+    ///
+    /// # Panics
+    /// Where `index >= len()`, as a slice does.
+    pub fn set_sh_rest(&mut self, index: usize, coefficients: &[[f32; 3]; SH_REST_MAX]) {
+        assert!(index < self.len(), "Gaussian {index} of {}", self.len());
+        let rows = sh_rest_rows(self.sh_degree);
+        let block = index / LANES;
+        for (row, lanes) in self.rest[block * rows..(block + 1) * rows].iter_mut().enumerate() {
+            lanes.0[index % LANES] = coefficients[row / 3][row % 3];
+        }
     }
 
     /// The Gaussian at `index`.
@@ -157,10 +222,12 @@ impl Gaussians {
         self.birth_rounds[index] = gaussian.birth_round;
     }
 
-    /// Appends one Gaussian.
+    /// Appends one Gaussian; its colour is the same from all directions until [`Gaussians::set_sh_rest`].
     pub fn push(&mut self, gaussian: &Gaussian) {
         if self.len().is_multiple_of(LANES) {
             self.blocks.push(Block::ZERO);
+            let rows = sh_rest_rows(self.sh_degree);
+            self.rest.resize(self.rest.len() + rows, Lanes([0.0; LANES]));
         }
         self.ids.push(gaussian.id);
         self.birth_rounds.push(gaussian.birth_round);
@@ -216,13 +283,20 @@ impl Gaussians {
 
     /// Whether every parameter of every Gaussian is finite.
     pub fn is_finite(&self) -> bool {
-        self.iter().all(|g| g.is_finite())
+        self.iter().all(|g| g.is_finite()) && self.rest.iter().all(|row| row.0.iter().all(|c| c.is_finite()))
     }
 
-    /// A model from blocks for exactly as many Gaussians as there are ids and birth rounds.
-    pub(crate) fn from_parts(blocks: Vec<Block>, ids: Vec<u64>, birth_rounds: Vec<u32>) -> Self {
+    /// A model of degree `sh_degree` from blocks (and rows of the higher bands) for exactly as many Gaussians as there
+    /// are ids and birth rounds.
+    pub(crate) fn from_parts(
+        blocks: Vec<Block>,
+        (sh_degree, rest): (u8, Vec<Lanes>),
+        ids: Vec<u64>,
+        birth_rounds: Vec<u32>,
+    ) -> Self {
         debug_assert!(blocks.len() == ids.len().div_ceil(LANES) && ids.len() == birth_rounds.len());
-        Self { blocks, ids, birth_rounds }
+        debug_assert!(rest.len() == blocks.len() * sh_rest_rows(sh_degree));
+        Self { blocks, rest, sh_degree, ids, birth_rounds }
     }
 
     pub(crate) fn blocks(&self) -> &[Block] {
@@ -233,8 +307,25 @@ impl Gaussians {
         &mut self.blocks
     }
 
+    /// Rows of the higher bands of one block.
+    pub(crate) fn rest_rows(&self, block: usize) -> &[Lanes] {
+        let rows = sh_rest_rows(self.sh_degree);
+        &self.rest[block * rows..(block + 1) * rows]
+    }
+
+    /// Blocks and rows of the higher bands, [`sh_rest_rows`] of each block in turn.
+    pub(crate) fn parts_mut(&mut self) -> (&mut [Block], &mut [Lanes]) {
+        (&mut self.blocks, &mut self.rest)
+    }
+
+    /// Rows of the higher bands of all blocks.
+    pub(crate) fn rest(&self) -> &[Lanes] {
+        &self.rest
+    }
+
     fn select(&mut self, from: &[u32]) {
         self.blocks = select_lanes(&self.blocks, from);
+        self.rest = select_row_lanes(&self.rest, sh_rest_rows(self.sh_degree), from);
         self.ids = from.iter().map(|&i| self.ids[i as usize]).collect();
         self.birth_rounds = from.iter().map(|&i| self.birth_rounds[i as usize]).collect();
     }
@@ -264,6 +355,32 @@ pub(crate) fn select_lanes(blocks: &[Block], from: &[u32]) -> Vec<Block> {
         selected[to / LANES].copy_lane(to % LANES, &blocks[i / LANES], i % LANES);
     }
     selected
+}
+
+/// New rows, `rows` for each block, whose lane `i` is the old lane `from[i]`.
+pub(crate) fn select_row_lanes(old: &[Lanes], rows: usize, from: &[u32]) -> Vec<Lanes> {
+    let mut selected = vec![Lanes([0.0; LANES]); from.len().div_ceil(LANES) * rows];
+    if rows == 0 {
+        return selected;
+    }
+    for (to, &i) in from.iter().enumerate() {
+        let i = i as usize;
+        let (to_block, from_block) = (to / LANES * rows, i / LANES * rows);
+        for row in 0..rows {
+            selected[to_block + row].0[to % LANES] = old[from_block + row].0[i % LANES];
+        }
+    }
+    selected
+}
+
+/// Rows of `blocks` blocks with `from` rows each, cut or filled with zeros to `to` rows each.
+pub(crate) fn resize_rows(old: &[Lanes], from: usize, to: usize, blocks: usize) -> Vec<Lanes> {
+    let mut new = vec![Lanes([0.0; LANES]); blocks * to];
+    for block in 0..blocks {
+        let kept = from.min(to);
+        new[block * to..][..kept].copy_from_slice(&old[block * from..][..kept]);
+    }
+    new
 }
 
 /// Spreads the low 10 bits so that two zero bits follow each (one axis of a 3-D Morton code).
@@ -310,6 +427,32 @@ mod tests {
         assert_eq!(model.iter().collect::<Vec<_>>(), expected);
         model.push(&gaussian(99));
         assert_eq!(model.get(model.len() - 1), gaussian(99));
+    }
+
+    #[test]
+    fn higher_bands_stay_with_their_gaussian() {
+        let bands = |i: usize| std::array::from_fn(|k| [k as f32, i as f32, 0.5 * i as f32]);
+        let mut model = Gaussians::with_sh_degree(2);
+        for i in 0..40 {
+            model.push(&gaussian(i));
+            model.set_sh_rest(i, &bands(i));
+        }
+        model.retain(|i| i % 2 == 1);
+        model.permute(&(0..20).rev().collect::<Vec<u32>>());
+        let expected = |i: usize, coefficients: usize| {
+            let mut bands = bands(39 - 2 * i);
+            bands[coefficients..].fill([0.0; 3]);
+            bands
+        };
+        assert!((0..20).all(|i| model.sh_rest(i) == expected(i, 8)));
+        model.set_sh_degree(3);
+        assert!((0..20).all(|i| model.sh_rest(i) == expected(i, 8)), "new bands are zero");
+        model.set_sh_degree(1);
+        assert!((0..20).all(|i| model.sh_rest(i) == expected(i, 3)), "dropped bands are gone");
+        let mut broken = bands(0);
+        broken[1][2] = f32::NAN;
+        model.set_sh_rest(3, &broken);
+        assert!(!model.is_finite());
     }
 
     #[test]

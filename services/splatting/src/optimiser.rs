@@ -1,6 +1,9 @@
 //! Adam with a state that lives as long as the mission (A32), one step count per Gaussian, drawn Gaussians only.
 
-use crate::model::{Block, LANES, ROW_LOG_SCALE, ROW_OPACITY, ROW_ROTATION, ROW_SH, ROWS, select_lanes};
+use crate::model::{
+    Block, Gaussians, LANES, Lanes, ROW_LOG_SCALE, ROW_OPACITY, ROW_ROTATION, ROW_SH, ROWS, resize_rows, select_lanes,
+    select_row_lanes, sh_rest_rows,
+};
 use crate::settings::TrainingSettings;
 use crate::simd::Simd;
 
@@ -12,6 +15,10 @@ use crate::simd::Simd;
 pub struct Optimiser {
     pub(crate) first: Vec<Block>,
     pub(crate) second: Vec<Block>,
+    /// Moments of the higher bands, as many rows for each block as the model has.
+    pub(crate) first_rest: Vec<Lanes>,
+    pub(crate) second_rest: Vec<Lanes>,
+    pub(crate) sh_degree: u8,
     pub(crate) steps: Vec<u32>,
 }
 
@@ -36,14 +43,27 @@ impl Optimiser {
         self.steps.get(index).copied().unwrap_or(0)
     }
 
-    /// Gives zero state to Gaussians appended to the model, or drops that of Gaussians cut from its end.
-    pub fn resize(&mut self, length: usize) {
+    /// Takes the shape of a model: zero state for Gaussians appended to it and for bands added to it, none for
+    /// Gaussians cut from its end.
+    pub fn fit(&mut self, model: &Gaussians) {
+        let degree = model.sh_degree();
+        if degree != self.sh_degree {
+            let (from, to) = (sh_rest_rows(self.sh_degree), sh_rest_rows(degree));
+            for rest in [&mut self.first_rest, &mut self.second_rest] {
+                *rest = resize_rows(rest, from, to, self.first.len());
+            }
+            self.sh_degree = degree;
+        }
+        let length = model.len();
         if length < self.len() {
             self.retain(|i| i < length);
         }
         let blocks = length.div_ceil(LANES);
         self.first.resize(blocks, Block::ZERO);
         self.second.resize(blocks, Block::ZERO);
+        for rest in [&mut self.first_rest, &mut self.second_rest] {
+            rest.resize(blocks * sh_rest_rows(degree), Lanes([0.0; LANES]));
+        }
         self.steps.resize(length, 0);
     }
 
@@ -54,7 +74,7 @@ impl Optimiser {
     }
 
     /// Reorders: the new state `i` is the old state `order[i]`. Gaussians without state yet must have been given it
-    /// by [`Optimiser::resize`].
+    /// by [`Optimiser::fit`].
     ///
     /// # Panics
     /// Where `order` is not as long as the state or names an index outside of it.
@@ -66,6 +86,9 @@ impl Optimiser {
     fn select(&mut self, from: &[u32]) {
         self.first = select_lanes(&self.first, from);
         self.second = select_lanes(&self.second, from);
+        let rows = sh_rest_rows(self.sh_degree);
+        self.first_rest = select_row_lanes(&self.first_rest, rows, from);
+        self.second_rest = select_row_lanes(&self.second_rest, rows, from);
         self.steps = from.iter().map(|&i| self.steps[i as usize]).collect();
     }
 }

@@ -36,7 +36,7 @@ impl Engine {
         view: &TrainingView,
         settings: &TrainingSettings,
     ) -> LossTerms {
-        optimiser.resize(gaussians.len());
+        optimiser.fit(gaussians);
         self.corrections.update(settings.betas);
         let terms = self.accumulate(gaussians, view, settings);
         let accumulated = Instant::now();

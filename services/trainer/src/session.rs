@@ -392,7 +392,7 @@ impl Session {
     }
 
     fn retain(&mut self, kept: &[bool]) {
-        self.optimiser.resize(self.model.len());
+        self.optimiser.fit(&self.model);
         self.model.retain(|i| kept.get(i).copied().unwrap_or(false));
         self.optimiser.retain(|i| kept.get(i).copied().unwrap_or(false));
     }
@@ -405,7 +405,7 @@ impl Session {
         self.retain(&kept);
         self.progression.next_gaussian_id += born.len() as u64;
         self.model.extend(born);
-        self.optimiser.resize(self.model.len());
+        self.optimiser.fit(&self.model);
         let order = self.model.morton_order();
         self.model.permute(&order);
         self.optimiser.permute(&order);

@@ -155,7 +155,7 @@ fn state_follows_retain_and_permute() {
     assert_eq!((&model, &optimiser), (&model2, &optimiser2));
     // A new Gaussian begins at 0.
     model.push(&scene(1, 5).get(0));
-    optimiser.resize(51);
+    optimiser.fit(&model);
     assert_eq!((optimiser.len(), optimiser.steps(50)), (51, 0));
 }
 
