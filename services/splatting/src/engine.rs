@@ -62,6 +62,21 @@ pub struct MomentsView {
     pub reference_m: f32,
 }
 
+/// How much the last training step had to do, for benchmarks.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Work {
+    /// Gaussians of the model.
+    pub gaussians: usize,
+    /// Gaussians that may touch the image.
+    pub visible: usize,
+    /// Pairs of a tile and a splat that may touch it.
+    pub entries: usize,
+    /// Pairs of a 4x4 block and a splat that changed one of its pixels.
+    pub contributions: usize,
+    /// Pixels of the view.
+    pub pixels: usize,
+}
+
 /// Why an engine could not be made or did not finish.
 #[derive(Debug, Error)]
 pub enum EngineError {
@@ -150,6 +165,19 @@ impl Engine {
     /// projection with Adam. For benchmarks and health figures; nothing depends on it.
     pub fn stage_times(&self) -> [Duration; 7] {
         self.stage_times
+    }
+
+    /// What the last training step had to do.
+    pub fn work(&self) -> Work {
+        let tiles = self.frame.tiles();
+        let contributors = self.contributors.iter().take(tiles);
+        Work {
+            gaussians: self.frame.rows.len(),
+            visible: self.frame.visible.iter().map(|lanes| lanes.count_ones() as usize).sum(),
+            entries: self.frame.entries.len(),
+            contributions: contributors.flat_map(|c| &c.lists).map(Vec::len).sum(),
+            pixels: tiles * TILE * TILE,
+        }
     }
 
     /// Renders colour, alpha and expected depth. Broken Gaussians (not finite, absurdly large) are left out; a camera

@@ -257,7 +257,13 @@ impl Frame {
     /// Footprint of a visible Gaussian.
     #[inline(always)]
     pub(crate) fn footprint(&self, gaussian: usize) -> Footprint {
-        let row = &self.rows[gaussian].0;
+        self.footprint_of(gaussian, &self.rows[gaussian])
+    }
+
+    /// Footprint of a visible Gaussian whose row is at hand.
+    #[inline(always)]
+    pub(crate) fn footprint_of(&self, gaussian: usize, row: &Row) -> Footprint {
+        let row = &row.0;
         let (corner, extent) = (row[CORNER].to_bits(), row[EXTENT].to_bits());
         Footprint {
             slot: self.slot_bases[gaussian / CHUNK] + row[SLOT].to_bits() as usize,

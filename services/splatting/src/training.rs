@@ -4,7 +4,7 @@
 
 use std::time::Instant;
 
-use crate::backward::BackwardTile;
+use crate::backward::{BackwardTile, TOUCHED};
 use crate::engine::Engine;
 use crate::frame::{Frame, Row, TILE};
 use crate::gradient::block_gradient;
@@ -142,9 +142,9 @@ impl Engine {
                     scratch,
                 };
                 dispatch(self.isa, kernel);
-                for ((&gaussian, sum), &has) in entries.iter().zip(&scratch.sums).zip(&scratch.touched) {
-                    if has {
-                        let slot = frame.footprint(gaussian as usize).slot_in(tile_x, tile_y);
+                for ((&gaussian, sum), row) in entries.iter().zip(&scratch.sums).zip(&scratch.rows) {
+                    if sum.0[TOUCHED] > 0.0 {
+                        let slot = frame.footprint_of(gaussian as usize, row).slot_in(tile_x, tile_y);
                         // SAFETY: every (tile, Gaussian) has a slot of its own, and each tile is given to one task.
                         unsafe {
                             slots.write(slot, *sum);

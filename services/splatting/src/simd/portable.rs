@@ -141,10 +141,6 @@ impl Simd for Portable {
         *rows = std::array::from_fn(|i| std::array::from_fn(|j| rows[j][i]));
     }
     #[inline(always)]
-    fn sum_rows_10(self, rows: &[F16; 10]) -> F16 {
-        std::array::from_fn(|i| rows.get(i).map_or(0.0, |row| row.iter().sum()))
-    }
-    #[inline(always)]
     fn append_hits<const N: usize>(
         self,
         hits: &[u32; 16],
