@@ -21,19 +21,17 @@ use crate::simd::{Kernel, Simd, build};
 pub(crate) const MOMENTS: usize = 10;
 /// Lane of a sum that is positive where the splat changed a pixel.
 pub(crate) const TOUCHED: usize = 10;
-const PREFETCH: usize = 16;
+const PREFETCH: usize = 24;
 /// Splats evaluated and reduced together.
 const TOGETHER: usize = 4;
 /// How many contributors ahead rows and sums are asked for: a tile's do not fit the first-level cache.
 const AHEAD: usize = 8;
 
-/// Memory of a worker, and after a run the tile's result.
+/// Memory of a worker.
 #[derive(Default)]
 pub(crate) struct Scratch {
     /// Rows of the tile's list, and one that changes nothing.
     pub rows: Vec<Row>,
-    /// Moments by position in the tile's list.
-    pub sums: Vec<Row>,
 }
 
 pub(crate) struct BackwardTile<'a> {
@@ -47,6 +45,9 @@ pub(crate) struct BackwardTile<'a> {
     pub gradients: &'a TilePixels,
     pub alpha_min: f32,
     pub scratch: &'a mut Scratch,
+    /// Result: moments by position in the tile's list as far as it was used. One longer than the list, for the row that
+    /// changes nothing.
+    pub sums: &'a mut [Row],
 }
 
 /// What a block's pixels need.
@@ -72,18 +73,19 @@ impl Kernel for BackwardTile<'_> {
     fn run<S: Simd>(self, s: S) {
         let used = self.contributors.used;
         let scratch = self.scratch;
-        scratch.rows.clear();
-        scratch.rows.extend(self.entries[..used].iter().enumerate().map(|(i, &g)| {
+        let nothing = s.splat(0.0);
+        scratch.rows.resize((used + 1).max(scratch.rows.len()), Lanes([0.0; 16]));
+        let rows = &mut scratch.rows[..=used];
+        let sums = &mut self.sums[..=used];
+        for (i, (&gaussian, (row, sum))) in self.entries.iter().zip(rows.iter_mut().zip(sums.iter_mut())).enumerate() {
             prefetch(self.entries.get(i + PREFETCH).map(|&g| &self.rows[g as usize]));
-            self.rows[g as usize]
-        }));
-        let mut nothing = Lanes([0.0; 16]);
-        nothing.0[LOG2_ALPHA] = -200.0;
-        scratch.rows.push(nothing);
-        scratch.sums.clear();
-        scratch.sums.resize(used + 1, Lanes([0.0; 16]));
-        let rows = &scratch.rows[..];
-        let sums = &mut scratch.sums[..rows.len()];
+            s.store(s.load(&self.rows[gaussian as usize].0), &mut row.0);
+            s.store(nothing, &mut sum.0);
+        }
+        rows[used] = Lanes([0.0; 16]);
+        rows[used].0[LOG2_ALPHA] = -200.0;
+        sums[used] = Lanes([0.0; 16]);
+        let rows = &*rows;
         let one = s.splat(1.0);
 
         for block in 0..BLOCKS {

@@ -112,8 +112,10 @@ pub struct Engine {
     pub(crate) ssim_scratch: PerWorker<ssim::Scratch>,
     pub(crate) contributors: Vec<Contributors>,
     pub(crate) loss: LossImages,
-    pub(crate) slots: Vec<Lanes>,
-    pub(crate) touched: Vec<u8>,
+    /// Gradient moments of every (tile, splat), tile after tile in the order of its list.
+    pub(crate) sums: Vec<Lanes>,
+    /// Where in `sums` each slot's moments are.
+    pub(crate) places: Vec<u32>,
     pub(crate) corrections: Corrections,
     singles: PerWorker<Single>,
     pub(crate) stage_times: [Duration; 7],
@@ -142,8 +144,8 @@ impl Engine {
             ssim_scratch: PerWorker::new(&workers),
             contributors: Vec::new(),
             loss: LossImages::default(),
-            slots: Vec::new(),
-            touched: Vec::new(),
+            sums: Vec::new(),
+            places: Vec::new(),
             corrections: Corrections::default(),
             singles: PerWorker::new(&workers),
             stage_times: [Duration::ZERO; 7],

@@ -94,6 +94,15 @@ fn take_apart(_proof: Avx2, x: __m256) -> (__m256, __m256) {
     })
 }
 
+/// Bits a | b << 16 of whole numbers.
+#[inline(always)]
+fn pack_u16(_proof: Avx2, a: __m256, b: __m256) -> __m256 {
+    with_avx2!({
+        let high = _mm256_slli_epi32::<16>(_mm256_cvttps_epi32(b));
+        _mm256_castsi256_ps(_mm256_or_si256(_mm256_cvttps_epi32(a), high))
+    })
+}
+
 /// A mask from the low eight bits.
 #[inline(always)]
 fn mask_8(_proof: Avx2, bits: i32) -> __m256 {
@@ -191,6 +200,14 @@ impl Simd for Avx2 {
     fn abs(self, a: Pair) -> Pair {
         let sign = self.splat(-0.0);
         with_avx2!((_mm256_andnot_ps(sign.0, a.0), _mm256_andnot_ps(sign.1, a.1)))
+    }
+    #[inline(always)]
+    fn floor(self, a: Pair) -> Pair {
+        with_avx2!((_mm256_floor_ps(a.0), _mm256_floor_ps(a.1)))
+    }
+    #[inline(always)]
+    fn pack_u16(self, a: Pair, b: Pair) -> Pair {
+        (pack_u16(self, a.0, b.0), pack_u16(self, a.1, b.1))
     }
     #[inline(always)]
     fn ge(self, a: Pair, b: Pair) -> Pair {

@@ -127,6 +127,17 @@ impl Simd for Avx512 {
         with_avx512!(_mm512_abs_ps(a))
     }
     #[inline(always)]
+    fn floor(self, a: __m512) -> __m512 {
+        with_avx512!(_mm512_roundscale_ps::<0x09>(a))
+    }
+    #[inline(always)]
+    fn pack_u16(self, a: __m512, b: __m512) -> __m512 {
+        with_avx512!({
+            let high = _mm512_slli_epi32::<16>(_mm512_cvttps_epi32(b));
+            _mm512_castsi512_ps(_mm512_or_si512(_mm512_cvttps_epi32(a), high))
+        })
+    }
+    #[inline(always)]
     fn ge(self, a: __m512, b: __m512) -> __mmask16 {
         with_avx512!(_mm512_cmp_ps_mask::<_CMP_GE_OQ>(a, b))
     }
