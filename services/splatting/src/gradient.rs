@@ -26,9 +26,9 @@ pub(crate) struct BlockGradient<S: Simd> {
 }
 
 /// Sums a block's partials over tiles, in the order of the tiles, and takes them through the projection. `rest` are the
-/// rows of higher bands that are evaluated.
+/// rows of higher bands that are evaluated; without `BANDS`, which costs nothing then, there are none.
 #[inline(always)]
-pub(crate) fn block_gradient<S: Simd>(
+pub(crate) fn block_gradient<S: Simd, const BANDS: bool>(
     s: S,
     view: &View,
     frame: &Frame,
@@ -61,7 +61,7 @@ pub(crate) fn block_gradient<S: Simd>(
     let projected = project(s, view, block, drawn);
     let mut rows = parameter_gradients(s, view, &projected, &moments);
     let mut bands = None;
-    if !rest.is_empty() {
+    if BANDS {
         let d_color = [moments[6], moments[7], moments[8]];
         bands = Some(sh::bands_gradient(s, view, block, rest, &d_color, &mut rows[ROW_MEAN..]));
     }

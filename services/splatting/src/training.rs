@@ -86,7 +86,15 @@ impl Engine {
                 }
             };
             // SAFETY: one task per chunk.
-            unsafe { results.write(chunk, dispatch(self.isa, kernel)) };
+            unsafe {
+                results.write(
+                    chunk,
+                    match pass.sh_rows {
+                        0 => dispatch(self.isa, WithBands::<false, _>(kernel)),
+                        _ => dispatch(self.isa, WithBands::<true, _>(kernel)),
+                    },
+                );
+            };
         });
         self.stage_times[6] = accumulated.elapsed();
         finish(terms, &isotropic, gaussians.len(), settings)
@@ -218,9 +226,14 @@ impl<'a> ParameterPass<'a> {
 
     /// Gradient of one block with the regulariser, and the regulariser's sum |s - mean(s)|.
     #[inline(always)]
-    fn block<S: Simd>(&self, s: S, index: usize, block: (&Block, &[Lanes])) -> Option<(BlockGradient<S>, f64)> {
+    fn block<S: Simd, const BANDS: bool>(
+        &self,
+        s: S,
+        index: usize,
+        block: (&Block, &[Lanes]),
+    ) -> Option<(BlockGradient<S>, f64)> {
         let partials = (self.slots, self.touched);
-        let mut gradient = block_gradient(s, &self.view, self.frame, partials, index, block)?;
+        let mut gradient = block_gradient::<S, BANDS>(s, &self.view, self.frame, partials, index, block)?;
         let mut sum = 0.0;
         if self.isotropic != 0.0 {
             let third = s.splat(1.0 / 3.0);
@@ -254,24 +267,31 @@ struct AdamChunk<'a> {
     second_rest: &'a mut [Lanes],
 }
 
-impl Kernel for AdamChunk<'_> {
+/// A kernel compiled with and without higher bands: at degree 0 they must not cost a register.
+struct WithBands<const BANDS: bool, K>(K);
+
+impl<const BANDS: bool> Kernel for WithBands<BANDS, AdamChunk<'_>> {
     type Output = f64;
 
     #[inline(always)]
     fn run<S: Simd>(self, s: S) -> f64 {
+        let chunk = self.0;
         let mut isotropic = 0.0;
-        let state = self.first.iter_mut().zip(self.second).zip(self.steps.chunks_mut(LANES));
-        for (i, (block, ((first, second), steps))) in self.blocks.iter_mut().zip(state).enumerate() {
-            let bands = i * self.rest_rows..i * self.rest_rows + self.pass.sh_rows;
-            let rest = &mut self.rest[bands.clone()];
-            if let Some((gradient, sum)) = self.pass.block(s, self.start + i, (block, rest)) {
-                isotropic += sum;
-                let corrections = self.adam.apply(s, &gradient.rows, gradient.lanes, block, (first, second, steps));
-                if let Some(basis) = &gradient.bands {
-                    let moments = (&mut self.first_rest[bands.clone()], &mut self.second_rest[bands]);
-                    let lanes = (gradient.lanes, &corrections);
-                    self.adam.apply_rest(s, (&gradient.rows, basis), lanes, rest, moments);
-                }
+        let state = chunk.first.iter_mut().zip(chunk.second).zip(chunk.steps.chunks_mut(LANES));
+        for (i, (block, ((first, second), steps))) in chunk.blocks.iter_mut().zip(state).enumerate() {
+            let bands = match BANDS {
+                true => i * chunk.rest_rows..i * chunk.rest_rows + chunk.pass.sh_rows,
+                false => 0..0,
+            };
+            let rest = &mut chunk.rest[bands.clone()];
+            let Some((gradient, sum)) = chunk.pass.block::<S, BANDS>(s, chunk.start + i, (block, rest)) else {
+                continue;
+            };
+            isotropic += sum;
+            let corrections = chunk.adam.apply(s, &gradient.rows, gradient.lanes, block, (first, second, steps));
+            if let Some(basis) = &gradient.bands {
+                let moments = (&mut chunk.first_rest[bands.clone()], &mut chunk.second_rest[bands]);
+                chunk.adam.apply_rest(s, (&gradient.rows, basis), (gradient.lanes, &corrections), rest, moments);
             }
         }
         isotropic
@@ -291,7 +311,7 @@ impl Kernel for GradientBlock<'_> {
     #[inline(always)]
     fn run<S: Simd>(self, s: S) -> Self::Output {
         let (mut out, mut bands) = (Block::ZERO, [Lanes([0.0; LANES]); 3 * SH_REST_MAX]);
-        let Some((gradient, sum)) = self.pass.block(s, self.index, (self.block, self.rest)) else {
+        let Some((gradient, sum)) = self.pass.block::<S, true>(s, self.index, (self.block, self.rest)) else {
             return (out, bands, 0.0);
         };
         for (to, row) in out.0.iter_mut().zip(gradient.rows) {
