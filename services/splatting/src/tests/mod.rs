@@ -3,6 +3,8 @@
 mod edges;
 mod forward;
 mod gradients;
+mod harmonics;
+mod hostile;
 mod training;
 
 use glam::{Quat, Vec3};
