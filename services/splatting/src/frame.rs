@@ -33,7 +33,6 @@ pub(crate) const C: usize = 4;
 pub(crate) const LOG2_ALPHA: usize = 5;
 /// Red, green, blue, depth, or what else is blended.
 pub(crate) const CHANNELS: usize = 6;
-pub(crate) const DEPTH: usize = 9;
 /// Largest exponent that still counts.
 pub(crate) const THRESHOLD: usize = 10;
 /// B/A and B/C, for the nearest point of a block.
@@ -72,7 +71,6 @@ pub(crate) struct Footprint {
     pub tile_x: usize,
     pub tile_y: usize,
     pub width: usize,
-    pub height: usize,
 }
 
 impl Footprint {
@@ -324,7 +322,6 @@ impl Frame {
             tile_x: (corner & 0xffff) as usize,
             tile_y: (corner >> 16) as usize,
             width: (extent & 0xffff) as usize,
-            height: (extent >> 16) as usize,
         }
     }
 }
