@@ -4,10 +4,10 @@
 
 use std::time::Instant;
 
-use crate::backward::BackwardTile;
+use crate::backward::{BackwardTile, TOUCHED};
 use crate::engine::Engine;
-use crate::frame::{Frame, Row, TILE};
-use crate::gradient::{BlockGradient, block_gradient};
+use crate::frame::{Frame, TILE};
+use crate::gradient::{BlockGradient, Partials, UNTOUCHED, block_gradient};
 use crate::loss;
 use crate::model::{Block, Gaussians, LANES, Lanes, ROW_LOG_SCALE, ROW_SH, ROWS, SH_C0, SH_REST_MAX, sh_rest_rows};
 use crate::optimiser::{AdamStep, Optimiser};
@@ -131,7 +131,7 @@ impl Engine {
         (finish(terms, &isotropic, gaussians.len(), settings), out)
     }
 
-    /// Renders the view, evaluates the loss, and leaves the moments of every (tile, Gaussian) in the slots.
+    /// Renders the view, evaluates the loss, and leaves the moments of every (tile, Gaussian) in the sums.
     fn accumulate(&mut self, gaussians: &Gaussians, view: &TrainingView, settings: &TrainingSettings) -> LossTerms {
         let camera = view.camera();
         let start = Instant::now();
@@ -155,38 +155,43 @@ impl Engine {
 
     pub(crate) fn backward(&mut self, settings: &TrainingSettings) {
         let frame = &self.frame;
-        if self.slots.len() < frame.slots {
+        // Every tile has one more sum than entries, for the row that fills up its kernel's last step.
+        let length = frame.entries.len() + frame.tiles();
+        if self.sums.len() < length {
             // A quarter more than needed: the number changes from view to view.
-            self.slots.resize(frame.slots + frame.slots / 4, Lanes([0.0; LANES]));
+            self.sums.resize(length + length / 4, Lanes([0.0; LANES]));
         }
-        self.touched.clear();
-        self.touched.resize(frame.slots, 0);
-        let slots = Shared::new(&mut self.slots);
-        let touched = Shared::new(&mut self.touched);
+        self.places.clear();
+        self.places.resize(frame.slots, UNTOUCHED);
+        let sums = Shared::new(&mut self.sums);
+        let places = Shared::new(&mut self.places);
         self.workers.run(frame.tiles(), |worker, task| {
             let tile = frame.schedule[task] as usize;
             let (tile_x, tile_y) = (tile % frame.tiles_x, tile / frame.tiles_x);
             let entries = frame.tile_entries(tile);
+            let first = frame.starts[tile] as usize + tile;
+            // SAFETY: the ranges of different tiles do not overlap, and each tile is given to one task.
+            let sums = unsafe { sums.slice_mut(first..first + entries.len() + 1) };
             self.backward_scratch.with(worker, |scratch| {
+                let contributors = &self.contributors[tile];
                 let kernel = BackwardTile {
                     origin: [tile_x * TILE, tile_y * TILE],
                     entries,
                     rows: &frame.rows,
-                    contributors: &self.contributors[tile],
+                    contributors,
                     pixels: &frame.pixels[tile],
                     gradients: &self.loss.gradients[tile],
                     alpha_min: settings.render.alpha_min,
-                    scratch,
+                    scratch: &mut *scratch,
+                    sums: &mut *sums,
                 };
                 dispatch(self.isa, kernel);
-                for ((&gaussian, sum), &has) in entries.iter().zip(&scratch.sums).zip(&scratch.touched) {
-                    if has {
-                        let slot = frame.footprint(gaussian as usize).slot_in(tile_x, tile_y);
+                let used = entries.iter().take(contributors.used).zip(sums).zip(&scratch.rows);
+                for (i, ((&gaussian, sum), row)) in used.enumerate() {
+                    if sum.0[TOUCHED] > 0.0 {
+                        let slot = frame.footprint_of(gaussian as usize, row).slot_in(tile_x, tile_y);
                         // SAFETY: every (tile, Gaussian) has a slot of its own, and each tile is given to one task.
-                        unsafe {
-                            slots.write(slot, *sum);
-                            touched.write(slot, 1);
-                        }
+                        unsafe { places.write(slot, (first + i) as u32) };
                     }
                 }
             });
@@ -204,8 +209,7 @@ fn finish(terms: LossTerms, isotropic: &[f64], count: usize, settings: &Training
 struct ParameterPass<'a> {
     view: View,
     frame: &'a Frame,
-    slots: &'a [Row],
-    touched: &'a [u8],
+    partials: Partials<'a>,
     /// Rows of the higher bands that are evaluated.
     sh_rows: usize,
     /// Isotropic weight divided by the number of standard deviations of the model.
@@ -217,8 +221,7 @@ impl<'a> ParameterPass<'a> {
         Self {
             view: View::new(view.camera(), &settings.render),
             frame: &engine.frame,
-            slots: &engine.slots,
-            touched: &engine.touched,
+            partials: Partials { sums: &engine.sums, places: &engine.places },
             sh_rows: model.active_sh_rows(settings.render.sh_degree),
             isotropic: settings.isotropic_weight / (3 * model.len().max(1)) as f32,
         }
@@ -232,8 +235,7 @@ impl<'a> ParameterPass<'a> {
         index: usize,
         block: (&Block, &[Lanes]),
     ) -> Option<(BlockGradient<S>, f64)> {
-        let partials = (self.slots, self.touched);
-        let mut gradient = block_gradient::<S, BANDS>(s, &self.view, self.frame, partials, index, block)?;
+        let mut gradient = block_gradient::<S, BANDS>(s, &self.view, self.frame, self.partials, index, block)?;
         let mut sum = 0.0;
         if self.isotropic != 0.0 {
             let third = s.splat(1.0 / 3.0);
