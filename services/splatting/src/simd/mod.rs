@@ -1,7 +1,7 @@
 //! Sixteen-wide f32 arithmetic over `std::arch`, chosen at run time.
 //!
 //! Kernels are written once, generic over [`Simd`], and entered through [`dispatch`], which compiles each of them for
-//! AVX-512, for AVX2 with FMA and for plain Rust. Stable Rust, no `target-cpu` flags: a binary built anywhere uses what
+//! AVX-512, for AVX2 with FMA, for NEON (on 64-bit ARM) and for plain Rust. Stable Rust, no `target-cpu` flags: a binary built anywhere uses what
 //! the machine it runs on has. A value of an implementation is the proof that its instructions exist, so calling a
 //! method is safe.
 
@@ -9,6 +9,8 @@
 mod avx2;
 #[cfg(target_arch = "x86_64")]
 mod avx512;
+#[cfg(target_arch = "aarch64")]
+mod neon;
 mod portable;
 
 #[cfg(target_arch = "x86_64")]
@@ -23,14 +25,19 @@ pub enum Isa {
     Avx512,
     /// AVX2 and FMA: two registers per 16 lanes.
     Avx2,
+    /// NEON: four registers per 16 lanes.
+    Neon,
     /// Plain Rust, for every other machine: correct, and many times slower.
     Portable,
 }
 
 impl Isa {
+    /// Every set, the widest first.
+    pub const ALL: [Self; 4] = [Self::Avx512, Self::Avx2, Self::Neon, Self::Portable];
+
     /// The widest set this machine has.
     pub fn detect() -> Self {
-        [Self::Avx512, Self::Avx2].into_iter().find(|isa| isa.is_available()).unwrap_or(Self::Portable)
+        Self::ALL.into_iter().find(|isa| isa.is_available()).unwrap_or(Self::Portable)
     }
 
     /// Whether this machine can run the set.
@@ -42,6 +49,7 @@ impl Isa {
             Self::Avx2 => Avx2::detect().is_some(),
             #[cfg(not(target_arch = "x86_64"))]
             Self::Avx512 | Self::Avx2 => false,
+            Self::Neon => cfg!(target_arch = "aarch64"),
             Self::Portable => true,
         }
     }
@@ -66,6 +74,9 @@ pub(crate) fn dispatch<K: Kernel>(isa: Isa, kernel: K) -> K::Output {
             Some(s) => avx2::enter(s, kernel),
             None => kernel.run(Portable),
         },
+        // Part of the target: no function of its own is needed to enable it.
+        #[cfg(target_arch = "aarch64")]
+        Isa::Neon => kernel.run(neon::Neon),
         _ => kernel.run(Portable),
     }
 }
@@ -367,7 +378,7 @@ mod tests {
         // Relative error allowed for each probe; the third is absolute near log2(1) = 0.
         let tolerance = [4e-7, 6e-6, 3e-7, 1e-4, 1e-6, 1e-6, 1e-6, 1e-6, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 2e-7, 0.0, 0.0];
         let mut ran = 0;
-        for isa in [Isa::Avx512, Isa::Avx2, Isa::Portable].into_iter().filter(|isa| isa.is_available()) {
+        for isa in Isa::ALL.into_iter().filter(|isa| isa.is_available()) {
             for x in inputs {
                 let got = dispatch(isa, Probe(x));
                 for ((got, want), tolerance) in got.iter().zip(expected(x)).zip(tolerance) {
@@ -383,7 +394,7 @@ mod tests {
 
     #[test]
     fn exp2_underflows_to_zero() {
-        for isa in [Isa::Avx512, Isa::Avx2, Isa::Portable].into_iter().filter(|isa| isa.is_available()) {
+        for isa in Isa::ALL.into_iter().filter(|isa| isa.is_available()) {
             let got = dispatch(isa, Probe([-1e9; 16]));
             assert!(got[0].iter().chain(&got[1]).all(|v| v.abs() < 1e-37), "{isa:?}: {got:?}");
         }
