@@ -3,8 +3,11 @@
 use crate::backward::MOMENTS;
 use crate::frame::Frame;
 use crate::frame::Row;
-use crate::model::{Block, LANES, ROW_LOG_SCALE, ROW_MEAN, ROW_OPACITY, ROW_ROTATION, ROW_SH, ROWS, SH_C0};
+use crate::model::{
+    Block, LANES, Lanes, ROW_LOG_SCALE, ROW_MEAN, ROW_OPACITY, ROW_ROTATION, ROW_SH, ROWS, SH_C0, SH_REST_MAX,
+};
 use crate::projection::{Projected, View, project};
+use crate::sh;
 use crate::simd::{Simd, build};
 
 /// A gradient beyond this in any parameter is a broken Gaussian: it is left as it is.
@@ -13,6 +16,9 @@ const GRADIENT_MAX: f32 = 1e15;
 /// Gradients of one block of 16 Gaussians.
 pub(crate) struct BlockGradient<S: Simd> {
     pub rows: [S::F; ROWS],
+    /// Where higher bands are evaluated: their basis functions. The gradient of a coefficient is its function times
+    /// that of the colour, which is the one of degree 0 divided by [`SH_C0`].
+    pub bands: Option<[S::F; SH_REST_MAX]>,
     /// Lanes that changed at least one pixel and whose gradient is finite.
     pub lanes: S::M,
     /// Standard deviations, metres.
@@ -38,11 +44,12 @@ impl<S: Simd> BlockGradient<S> {
     pub(crate) fn zero(s: S) -> Self {
         let (zero, none) = (s.splat(0.0), s.mask(0));
         let screen = Screen { gradient: [zero; 2], covariance: [zero; 3], visible: none, moved: none };
-        Self { rows: [zero; ROWS], lanes: none, scales: [zero; 3], screen }
+        Self { rows: [zero; ROWS], bands: None, lanes: none, scales: [zero; 3], screen }
     }
 }
 
-/// Sums a block's partials over tiles, in the order of the tiles, and takes them through the projection.
+/// Sums a block's partials over tiles, in the order of the tiles, and takes them through the projection. `rest` are the
+/// rows of higher bands that are evaluated.
 ///
 /// `None` where none of the block's Gaussians changed a pixel, or with `OBSERVED` where none was projected into the image.
 #[inline(always)]
@@ -52,7 +59,7 @@ pub(crate) fn block_gradient<S: Simd, const OBSERVED: bool>(
     frame: &Frame,
     (slots, touched): (&[Row], &[u8]),
     block_index: usize,
-    block: &Block,
+    (block, rest): (&Block, &[Lanes]),
 ) -> Option<BlockGradient<S>> {
     let visible = frame.visible[block_index];
     let zero = s.splat(0.0);
@@ -78,7 +85,12 @@ pub(crate) fn block_gradient<S: Simd, const OBSERVED: bool>(
     s.transpose(&mut rows);
     let moments = build!(zero; MOMENTS; |i| rows[i]);
     let projected = project(s, view, block, projected_lanes);
-    let (rows, d_mean) = parameter_gradients(s, view, &projected, &moments);
+    let (mut rows, d_mean) = parameter_gradients(s, view, &projected, &moments);
+    let mut bands = None;
+    if !rest.is_empty() {
+        let d_color = [moments[6], moments[7], moments[8]];
+        bands = Some(sh::bands_gradient(s, view, block, rest, &d_color, &mut rows[ROW_MEAN..]));
+    }
     let mut size = zero;
     for g in rows {
         size = s.add(size, s.abs(g));
@@ -88,7 +100,7 @@ pub(crate) fn block_gradient<S: Simd, const OBSERVED: bool>(
     let [a, b, c] = projected.raw;
     let covariance = [s.add(a, low_pass), b, s.add(c, low_pass)];
     let screen = Screen { gradient: d_mean, covariance, visible: s.mask(visible), moved: lanes };
-    Some(BlockGradient { rows, lanes, scales: projected.scales, screen })
+    Some(BlockGradient { rows, bands, lanes, scales: projected.scales, screen })
 }
 
 /// Chain rule from the ten moments to the fourteen parameters, and to the mean's position in pixels.

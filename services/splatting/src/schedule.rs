@@ -75,13 +75,16 @@ impl Schedule {
         (iteration / self.sh_degree_every.max(1)).min(u32::from(self.sh_degree.min(SH_DEGREE_MAX))) as u8
     }
 
-    /// Sets the learning rates of an iteration.
+    /// Sets the learning rates of an iteration, and the degree of spherical harmonics that is rendered: the model itself
+    /// has all its bands from the beginning.
     pub fn apply(&self, iteration: u32, settings: &mut TrainingSettings) {
         settings.lr_means = self.means(iteration);
         settings.lr_log_scales = self.log_scales;
         settings.lr_rotations = self.rotations;
         settings.lr_opacity = self.opacity;
         settings.lr_sh = self.sh;
+        settings.lr_sh_rest = self.sh * self.sh_rest_fraction;
+        settings.render.sh_degree = self.sh_degree(iteration);
     }
 }
 
@@ -109,7 +112,8 @@ mod tests {
         let mut settings = TrainingSettings::default();
         schedule.apply(15_000, &mut settings);
         assert_eq!(settings.lr_means, schedule.means(15_000));
-        assert_eq!((settings.lr_opacity, settings.lr_sh), (0.05, 2.5e-3));
+        assert_eq!((settings.lr_opacity, settings.lr_sh, settings.lr_sh_rest), (0.05, 2.5e-3, 1.25e-4));
+        assert_eq!(settings.render.sh_degree, 3);
         let short = schedule.scaled(7.0 / 30.0);
         assert!((short.means(3500) / 3.2e-5 - 1.0).abs() < 1e-3 && (short.means(7000) / 3.2e-6 - 1.0).abs() < 1e-3);
     }

@@ -3,6 +3,7 @@
 mod edges;
 mod forward;
 mod gradients;
+mod harmonics;
 mod statistics;
 mod training;
 
