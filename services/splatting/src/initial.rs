@@ -135,3 +135,60 @@ pub fn random_points(count: usize, low: Vec3, high: Vec3, seed: u64) -> Result<V
         .map(|_| ColoredPoint { position: low + (high - low) * Vec3::from_array(three()), color: three() })
         .collect())
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn gaussians_are_as_large_as_the_distance_to_their_neighbours() {
+        // A line with a spacing of 0.1 m: two neighbours at 0.1 m and one at 0.2 m, at its ends 0.1, 0.2 and 0.3 m.
+        let points: Vec<ColoredPoint> = (0..30)
+            .map(|i| ColoredPoint { position: Vec3::X * (0.1 * i as f32), color: [0.01 * i as f32, 0.5, 1.0] })
+            .collect();
+        let model = InitialGaussians::PUBLISHED.from_points(&points).unwrap();
+        for (i, (gaussian, point)) in model.iter().zip(&points).enumerate() {
+            assert_eq!((gaussian.mean, gaussian.id), (point.position, i as u64));
+            let sigma = if i == 0 || i == 29 { (0.14_f32 / 3.0).sqrt() } else { (0.06_f32 / 3.0).sqrt() };
+            assert!((gaussian.log_scales.exp() - sigma).abs().max_element() < 1e-4, "{i}: {}", gaussian.log_scales);
+            assert!((gaussian.opacity() - 0.1).abs() < 1e-6);
+            assert!(gaussian.color().iter().zip(point.color).all(|(got, want)| (got - want).abs() < 1e-6));
+        }
+        let small = InitialGaussians::MCMC.from_points(&points).unwrap().get(3);
+        assert!(
+            (small.log_scales.exp().x - 0.1 * 0.02_f32.sqrt()).abs() < 1e-5 && (small.opacity() - 0.5).abs() < 1e-6
+        );
+        // Points that coincide, and points that are absurdly far apart, still make a model.
+        let mut points = vec![points[0]; 6];
+        points[5].position = Vec3::splat(1e30);
+        assert!(InitialGaussians::PUBLISHED.from_points(&points).unwrap().is_finite());
+    }
+
+    #[test]
+    fn random_points_fill_their_box_and_are_the_same_again() {
+        let (low, high) = (Vec3::new(-1.0, 2.0, 0.0), Vec3::new(1.0, 2.5, 4.0));
+        let points = random_points(2000, low, high, 9).unwrap();
+        assert!(points.iter().all(|p| p.position.cmpge(low).all() && p.position.cmple(high).all()));
+        let mean = points.iter().map(|p| p.position).sum::<Vec3>() / 2000.0;
+        assert!(((mean - 0.5 * (low + high)) / (high - low)).abs().max_element() < 0.03, "{mean}");
+        assert_eq!(points, random_points(2000, low, high, 9).unwrap());
+        assert_ne!(points, random_points(2000, low, high, 10).unwrap());
+    }
+
+    #[test]
+    fn what_cannot_be_begun_with_is_named() {
+        let point = ColoredPoint { position: Vec3::ONE, color: [0.5; 3] };
+        let error = |points: &[ColoredPoint]| InitialGaussians::PUBLISHED.from_points(points).unwrap_err();
+        assert_eq!(error(&[point; 3]), InitialError::TooFew { found: 3 });
+        let mut points = [point; 9];
+        points[7].color[2] = f32::NAN;
+        assert!(error(&points).to_string().starts_with("point 7 is not finite"));
+        let opaque = InitialGaussians { opacity: 1.0, ..InitialGaussians::PUBLISHED }.from_points(&[point; 4]);
+        assert!(opaque.unwrap_err().to_string().contains("initial `opacity` is 1"));
+        let flat = InitialGaussians { scale_factor: 0.0, ..InitialGaussians::PUBLISHED }.from_points(&[point; 4]);
+        assert!(flat.unwrap_err().to_string().contains("`scale_factor` is 0"));
+        for (low, high) in [(Vec3::ONE, Vec3::ONE), (Vec3::NAN, Vec3::ONE), (Vec3::ZERO, Vec3::INFINITY)] {
+            assert!(random_points(5, low, high, 1).unwrap_err().to_string().contains("random points in a box"));
+        }
+    }
+}

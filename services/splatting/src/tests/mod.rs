@@ -1,5 +1,7 @@
 //! The engine against the reference, and against itself on other instruction sets and thread counts.
 
+mod densify;
+mod densify_training;
 mod edges;
 mod forward;
 mod gradients;
