@@ -114,20 +114,36 @@ fn train(scene: &Scene, strategy: Strategy, threads: usize, iterations: u32) -> 
     (model, sum / scene.held_out.len() as f64)
 }
 
-fn strategies(iterations: u32) -> [Strategy; 3] {
-    let factor = f64::from(iterations) / 30_000.0;
-    let default = DefaultSettings { max_gaussians: 2500, refine_every: 400, ..DefaultSettings::default() };
-    let mcmc = McmcSettings { max_gaussians: 2500, growth: 1.15, refine_every: 300, ..McmcSettings::default() };
-    [Strategy::None, Strategy::Default(default).scaled(factor), Strategy::Mcmc(mcmc).scaled(factor)]
+/// The strategies with their published thresholds, in a run of a thousand iterations.
+fn strategies() -> [Strategy; 3] {
+    let (max_gaussians, refine_every, refine_start) = (3500, 25, 50);
+    let default = DefaultSettings { max_gaussians, refine_every, refine_start, ..DefaultSettings::default() };
+    let mcmc = McmcSettings { max_gaussians, refine_every, refine_start, ..McmcSettings::default() };
+    [
+        Strategy::None,
+        Strategy::Default(DefaultSettings { refine_stop: 650, reset_every: 350, ..default }),
+        Strategy::Mcmc(McmcSettings { refine_stop: 850, growth: 1.3, ..mcmc }),
+    ]
 }
 
 #[test]
 fn both_strategies_show_views_that_were_held_out_better_than_none() {
     let scene = observed_scene();
-    let iterations = 900;
-    for strategy in strategies(iterations) {
-        let start = std::time::Instant::now();
-        let (model, psnr) = train(&scene, strategy, 1, iterations);
-        println!("{psnr:.2} dB, {} Gaussians, {:?}", model.len(), start.elapsed());
+    let [(none, none_db), (default, default_db), (mcmc, mcmc_db)] = strategies().map(|s| train(&scene, s, 1, 1000));
+    assert_eq!(none.len(), scene.points.len());
+    assert!((1000..=3500).contains(&default.len()) && mcmc.len() == 3500, "{} {}", default.len(), mcmc.len());
+    let margin = default_db.min(mcmc_db) - none_db;
+    assert!(margin > 1.0, "{none_db:.2} dB without, {default_db:.2} dB by default, {mcmc_db:.2} dB with MCMC");
+}
+
+/// Same seed, same bits, for any number of threads: statistics, growth, noise, order.
+#[test]
+fn a_run_gives_the_same_bits_for_any_number_of_threads() {
+    let scene = observed_scene();
+    for strategy in strategies() {
+        let one = train(&scene, strategy, 1, 110);
+        assert!(strategy == Strategy::None || one.0.len() > scene.points.len());
+        assert!(one == train(&scene, strategy, 2, 110));
+        assert!(one == train(&scene, strategy, 3, 110));
     }
 }
