@@ -1,8 +1,8 @@
 //! From moments per splat to gradients per parameter: the projection, backwards.
 
 use crate::backward::MOMENTS;
+use crate::blend::prefetch;
 use crate::frame::Frame;
-use crate::frame::Row;
 use crate::model::{
     Block, LANES, Lanes, ROW_LOG_SCALE, ROW_MEAN, ROW_OPACITY, ROW_ROTATION, ROW_SH, ROWS, SH_C0, SH_REST_MAX,
 };
@@ -48,46 +48,72 @@ impl<S: Simd> BlockGradient<S> {
     }
 }
 
+/// Place of a slot whose tile the splat changed nothing in: there are zeros.
+pub(crate) const UNTOUCHED: u32 = 0;
+/// How many slots ahead sums are asked for: those of neighbours are apart, in the depth order of their tiles.
+const AHEAD: usize = 32;
+
+/// What the backward blend left behind.
+#[derive(Clone, Copy)]
+pub(crate) struct Partials<'a> {
+    /// Moments of every (tile, splat), tile after tile.
+    pub sums: &'a [f32],
+    /// For every slot, and behind them all, where its moments are or [`UNTOUCHED`].
+    pub places: &'a [u32],
+}
+
 /// Sums a block's partials over tiles, in the order of the tiles, and takes them through the projection. `rest` are the
-/// rows of higher bands that are evaluated.
+/// rows of higher bands that are evaluated; without `BANDS`, which costs nothing then, there are none.
 ///
 /// `None` where none of the block's Gaussians changed a pixel, or with `OBSERVED` where none was projected into the image.
 #[inline(always)]
-pub(crate) fn block_gradient<S: Simd, const OBSERVED: bool>(
+pub(crate) fn block_gradient<S: Simd, const BANDS: bool, const OBSERVED: bool>(
     s: S,
     view: &View,
     frame: &Frame,
-    (slots, touched): (&[Row], &[u8]),
+    partials: Partials<'_>,
     block_index: usize,
     (block, rest): (&Block, &[Lanes]),
 ) -> Option<BlockGradient<S>> {
-    let visible = frame.visible[block_index];
     let zero = s.splat(0.0);
     let mut rows = [zero; 16];
     let mut drawn = 0_u16;
-    let mut bits = visible;
-    while bits != 0 {
-        let lane = bits.trailing_zeros() as usize;
-        bits &= bits - 1;
-        let footprint = frame.footprint(block_index * LANES + lane);
-        let range = footprint.slot..footprint.slot + footprint.width * footprint.height;
-        for (slot, &touched) in slots[range.clone()].iter().zip(&touched[range]) {
-            if touched != 0 {
-                rows[lane] = s.add(rows[lane], s.load(&slot.0));
-                drawn |= 1 << lane;
+    let (first, base) = frame.block_slots(block_index);
+    let nowhere = frame.slots;
+    let mut add = |lane: usize, slot: usize| {
+        let place = partials.places[slot];
+        // Lanes beyond the moments hold those of a neighbour, and nobody asks for them.
+        if let Some(sum) = partials.sums[place as usize * MOMENTS..].first_chunk() {
+            rows[lane] = s.add(rows[lane], s.load(sum));
+        }
+        drawn |= u16::from(place != UNTOUCHED) << lane;
+    };
+    for lane in 0..LANES {
+        let (from, to) = (base + first[lane] as usize, base + first[lane + 1] as usize);
+        for ahead in 0..2 {
+            if let Some(&next) = partials.places.get(from + AHEAD + ahead) {
+                prefetch(partials.sums.get(next as usize * MOMENTS));
             }
         }
+        // Most splats touch one, two or four tiles: without a loop, whose end would be mispredicted.
+        for k in 0..4 {
+            let slot = from + k;
+            add(lane, if slot < to { slot } else { nowhere });
+        }
+        for slot in from + 4..to {
+            add(lane, slot);
+        }
     }
-    let projected_lanes = if OBSERVED { visible } else { drawn };
-    if projected_lanes == 0 {
+    let visible = if OBSERVED { frame.visible[block_index] } else { drawn };
+    if visible == 0 {
         return None;
     }
     s.transpose(&mut rows);
     let moments = build!(zero; MOMENTS; |i| rows[i]);
-    let projected = project(s, view, block, projected_lanes);
+    let projected = project(s, view, block, visible);
     let (mut rows, d_mean) = parameter_gradients(s, view, &projected, &moments);
     let mut bands = None;
-    if !rest.is_empty() {
+    if BANDS {
         let d_color = [moments[6], moments[7], moments[8]];
         bands = Some(sh::bands_gradient(s, view, block, rest, &d_color, &mut rows[ROW_MEAN..]));
     }

@@ -4,10 +4,10 @@
 
 use std::time::Instant;
 
-use crate::backward::BackwardTile;
+use crate::backward::{BackwardTile, MOMENTS, TOUCHED};
 use crate::engine::Engine;
-use crate::frame::{Frame, Row, TILE, block_lanes};
-use crate::gradient::{BlockGradient, block_gradient};
+use crate::frame::{Frame, TILE, block_lanes};
+use crate::gradient::{BlockGradient, Partials, UNTOUCHED, block_gradient};
 use crate::loss;
 use crate::model::{
     Block, Gaussians, LANES, Lanes, ROW_LOG_SCALE, ROW_OPACITY, ROW_SH, ROWS, SH_C0, SH_REST_MAX, sh_rest_rows,
@@ -98,8 +98,8 @@ impl Engine {
         self.workers.run(chunks, |_, chunk| {
             let range = chunk * CHUNK_BLOCKS..count.min((chunk + 1) * CHUNK_BLOCKS);
             let lanes = range.start * LANES..total.min(range.end * LANES);
-            let seen = range.start * observed_rows..range.end * observed_rows;
             let bands = range.start * rows..range.end * rows;
+            let seen = range.start * observed_rows..range.end * observed_rows;
             // SAFETY: the ranges of different chunks do not overlap.
             let kernel = unsafe {
                 AdamChunk::<OBSERVED> {
@@ -118,7 +118,15 @@ impl Engine {
                 }
             };
             // SAFETY: one task per chunk.
-            unsafe { results.write(chunk, dispatch(self.isa, kernel)) };
+            unsafe {
+                results.write(
+                    chunk,
+                    match pass.sh_rows {
+                        0 => dispatch(self.isa, WithBands::<false, _>(kernel)),
+                        _ => dispatch(self.isa, WithBands::<true, _>(kernel)),
+                    },
+                );
+            };
         });
         self.stage_times[6] = accumulated.elapsed();
         finish(terms, &sums, gaussians.len(), settings)
@@ -155,7 +163,7 @@ impl Engine {
         (finish(terms, &sums, gaussians.len(), settings), out)
     }
 
-    /// Renders the view, evaluates the loss, and leaves the moments of every (tile, Gaussian) in the slots.
+    /// Renders the view, evaluates the loss, and leaves the moments of every (tile, Gaussian) in the sums.
     fn accumulate(&mut self, gaussians: &Gaussians, view: &TrainingView, settings: &TrainingSettings) -> LossTerms {
         let camera = view.camera();
         let start = Instant::now();
@@ -179,38 +187,45 @@ impl Engine {
 
     pub(crate) fn backward(&mut self, settings: &TrainingSettings) {
         let frame = &self.frame;
-        if self.slots.len() < frame.slots {
+        // The first place is that of no splat and stays zero; behind the last there is room for a vector.
+        let length = (frame.entries.len() + 1) * MOMENTS + LANES;
+        if self.sums.len() < length {
             // A quarter more than needed: the number changes from view to view.
-            self.slots.resize(frame.slots + frame.slots / 4, Lanes([0.0; LANES]));
+            self.sums.resize(length + length / 4, 0.0);
         }
-        self.touched.clear();
-        self.touched.resize(frame.slots, 0);
-        let slots = Shared::new(&mut self.slots);
-        let touched = Shared::new(&mut self.touched);
+        self.places.clear();
+        self.places.resize(frame.slots + 1, UNTOUCHED);
+        let sums = Shared::new(&mut self.sums);
+        let places = Shared::new(&mut self.places);
         self.workers.run(frame.tiles(), |worker, task| {
             let tile = frame.schedule[task] as usize;
             let (tile_x, tile_y) = (tile % frame.tiles_x, tile / frame.tiles_x);
             let entries = frame.tile_entries(tile);
+            let first = frame.starts[tile] as usize + 1;
+            // SAFETY: the ranges of different tiles do not overlap, and each tile is given to one task.
+            let sums = unsafe { sums.slice_mut(first * MOMENTS..(first + entries.len()) * MOMENTS) };
             self.backward_scratch.with(worker, |scratch| {
+                let contributors = &self.contributors[tile];
                 let kernel = BackwardTile {
                     origin: [tile_x * TILE, tile_y * TILE],
                     entries,
                     rows: &frame.rows,
-                    contributors: &self.contributors[tile],
+                    contributors,
                     pixels: &frame.pixels[tile],
                     gradients: &self.loss.gradients[tile],
                     alpha_min: settings.render.alpha_min,
-                    scratch,
+                    scratch: &mut *scratch,
                 };
                 dispatch(self.isa, kernel);
-                for ((&gaussian, sum), &has) in entries.iter().zip(&scratch.sums).zip(&scratch.touched) {
-                    if has {
-                        let slot = frame.footprint(gaussian as usize).slot_in(tile_x, tile_y);
+                let used = entries.iter().take(contributors.used).zip(&scratch.sums).zip(&scratch.rows);
+                let mut kept = 0;
+                for ((&gaussian, sum), row) in used {
+                    if sum.0[TOUCHED] > 0.0 {
+                        sums[kept * MOMENTS..][..MOMENTS].copy_from_slice(&sum.0[..MOMENTS]);
+                        let slot = frame.footprint_of(gaussian as usize, row).slot_in(tile_x, tile_y);
                         // SAFETY: every (tile, Gaussian) has a slot of its own, and each tile is given to one task.
-                        unsafe {
-                            slots.write(slot, *sum);
-                            touched.write(slot, 1);
-                        }
+                        unsafe { places.write(slot, (first + kept) as u32) };
+                        kept += 1;
                     }
                 }
             });
@@ -252,12 +267,11 @@ fn finish(terms: LossTerms, parts: &[Sums], count: usize, settings: &TrainingSet
 struct ParameterPass<'a> {
     view: View,
     frame: &'a Frame,
-    slots: &'a [Row],
-    touched: &'a [u8],
-    /// Gaussians of the model.
-    count: usize,
+    partials: Partials<'a>,
     /// Rows of the higher bands that are evaluated.
     sh_rows: usize,
+    /// Gaussians of the model.
+    count: usize,
     /// Isotropic weight divided by the number of standard deviations of the model.
     isotropic: f32,
     /// Opacity weight divided by the number of Gaussians.
@@ -273,10 +287,9 @@ impl<'a> ParameterPass<'a> {
         Self {
             view: View::new(view.camera(), &settings.render),
             frame: &engine.frame,
-            slots: &engine.slots,
-            touched: &engine.touched,
-            count,
+            partials: Partials { sums: &engine.sums, places: &engine.places },
             sh_rows: model.active_sh_rows(settings.render.sh_degree),
+            count,
             isotropic: settings.isotropic_weight / deviations,
             opacity: settings.opacity_weight / gaussians,
             scale: settings.scale_weight / deviations,
@@ -285,14 +298,14 @@ impl<'a> ParameterPass<'a> {
 
     /// Gradient of one block with the regularisers, and their sums.
     #[inline(always)]
-    fn block<S: Simd, const OBSERVED: bool>(
+    fn block<S: Simd, const BANDS: bool, const OBSERVED: bool>(
         &self,
         s: S,
         index: usize,
-        (block, rest): (&Block, &[Lanes]),
+        block: (&Block, &[Lanes]),
     ) -> Option<(BlockGradient<S>, Sums)> {
-        let partials = (self.slots, self.touched);
-        let mut gradient = block_gradient::<S, OBSERVED>(s, &self.view, self.frame, partials, index, (block, rest));
+        let (view, frame, partials) = (&self.view, self.frame, self.partials);
+        let mut gradient = block_gradient::<S, BANDS, OBSERVED>(s, view, frame, partials, index, block);
         let mut sums = Sums::default();
         if let Some(gradient) = &mut gradient
             && self.isotropic != 0.0
@@ -314,7 +327,7 @@ impl<'a> ParameterPass<'a> {
                 Some(gradient) => gradient,
                 None => BlockGradient::zero(s),
             };
-            self.regularise(s, index, block, &mut all, &mut sums);
+            self.regularise(s, index, block.0, &mut all, &mut sums);
             return Some((all, sums));
         }
         Some((gradient?, sums))
@@ -370,28 +383,36 @@ struct AdamChunk<'a, const OBSERVED: bool> {
     second_rest: &'a mut [Lanes],
 }
 
-impl<const OBSERVED: bool> Kernel for AdamChunk<'_, OBSERVED> {
+/// A kernel compiled with and without higher bands: at degree 0 they must not cost a register.
+struct WithBands<const BANDS: bool, K>(K);
+
+impl<const BANDS: bool, const OBSERVED: bool> Kernel for WithBands<BANDS, AdamChunk<'_, OBSERVED>> {
     type Output = Sums;
 
     #[inline(always)]
     fn run<S: Simd>(self, s: S) -> Sums {
+        let chunk = self.0;
         let mut sums = Sums::default();
-        let state = self.first.iter_mut().zip(self.second).zip(self.steps.chunks_mut(LANES));
-        for (i, (block, ((first, second), steps))) in self.blocks.iter_mut().zip(state).enumerate() {
-            let bands = i * self.rest_rows..i * self.rest_rows + self.pass.sh_rows;
-            let rest = &mut self.rest[bands.clone()];
-            if let Some((gradient, sum)) = self.pass.block::<S, OBSERVED>(s, self.start + i, (block, rest)) {
-                sums += sum;
-                let corrections = self.adam.apply(s, &gradient.rows, gradient.lanes, block, (first, second, steps));
-                if let Some(basis) = &gradient.bands {
-                    let moments = (&mut self.first_rest[bands.clone()], &mut self.second_rest[bands]);
-                    let lanes = (gradient.lanes, &corrections);
-                    self.adam.apply_rest(s, (&gradient.rows, basis), lanes, rest, moments);
-                }
-                if OBSERVED {
-                    let rows = &mut self.observed[i * statistics::ROWS..(i + 1) * statistics::ROWS];
-                    observe(s, &self.pass.view, &gradient.screen, rows);
-                }
+        let state = chunk.first.iter_mut().zip(chunk.second).zip(chunk.steps.chunks_mut(LANES));
+        for (i, (block, ((first, second), steps))) in chunk.blocks.iter_mut().zip(state).enumerate() {
+            let bands = match BANDS {
+                true => i * chunk.rest_rows..i * chunk.rest_rows + chunk.pass.sh_rows,
+                false => 0..0,
+            };
+            let rest = &mut chunk.rest[bands.clone()];
+            let parameters = (&*block, &*rest);
+            let Some((gradient, sum)) = chunk.pass.block::<S, BANDS, OBSERVED>(s, chunk.start + i, parameters) else {
+                continue;
+            };
+            sums += sum;
+            let corrections = chunk.adam.apply(s, &gradient.rows, gradient.lanes, block, (first, second, steps));
+            if let Some(basis) = &gradient.bands {
+                let moments = (&mut chunk.first_rest[bands.clone()], &mut chunk.second_rest[bands]);
+                chunk.adam.apply_rest(s, (&gradient.rows, basis), (gradient.lanes, &corrections), rest, moments);
+            }
+            if OBSERVED {
+                let rows = &mut chunk.observed[i * statistics::ROWS..(i + 1) * statistics::ROWS];
+                observe(s, &chunk.pass.view, &gradient.screen, rows);
             }
         }
         sums
@@ -412,7 +433,7 @@ impl Kernel for GradientBlock<'_> {
     fn run<S: Simd>(self, s: S) -> Self::Output {
         let (mut out, mut bands) = (Block::ZERO, [Lanes([0.0; LANES]); 3 * SH_REST_MAX]);
         let block = (self.block, self.rest);
-        let Some((gradient, sums)) = self.pass.block::<S, false>(s, self.index, block) else {
+        let Some((gradient, sums)) = self.pass.block::<S, true, false>(s, self.index, block) else {
             return (out, bands, Sums::default());
         };
         for (to, row) in out.0.iter_mut().zip(gradient.rows) {

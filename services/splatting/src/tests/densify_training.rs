@@ -114,24 +114,24 @@ fn train(scene: &Scene, strategy: Strategy, threads: usize, iterations: u32) -> 
     (model, sum / scene.held_out.len() as f64)
 }
 
-/// The strategies with their published thresholds, in a run of a thousand iterations.
+/// The strategies with their published thresholds, in a run of 1,200 iterations.
 fn strategies() -> [Strategy; 3] {
-    let (max_gaussians, refine_every, refine_start) = (3500, 25, 50);
+    let (max_gaussians, refine_every, refine_start) = (4000, 25, 50);
     let default = DefaultSettings { max_gaussians, refine_every, refine_start, ..DefaultSettings::default() };
     let mcmc = McmcSettings { max_gaussians, refine_every, refine_start, ..McmcSettings::default() };
     [
         Strategy::None,
-        Strategy::Default(DefaultSettings { refine_stop: 650, reset_every: 350, ..default }),
-        Strategy::Mcmc(McmcSettings { refine_stop: 850, growth: 1.3, ..mcmc }),
+        Strategy::Default(DefaultSettings { refine_stop: 800, reset_every: 400, ..default }),
+        Strategy::Mcmc(McmcSettings { refine_stop: 1000, growth: 1.3, max_gaussians: 2500, ..mcmc }),
     ]
 }
 
 #[test]
 fn both_strategies_show_views_that_were_held_out_better_than_none() {
     let scene = observed_scene();
-    let [(none, none_db), (default, default_db), (mcmc, mcmc_db)] = strategies().map(|s| train(&scene, s, 1, 1000));
+    let [(none, none_db), (default, default_db), (mcmc, mcmc_db)] = strategies().map(|s| train(&scene, s, 1, 1200));
     assert_eq!(none.len(), scene.points.len());
-    assert!((1000..=3500).contains(&default.len()) && mcmc.len() == 3500, "{} {}", default.len(), mcmc.len());
+    assert!((1000..=4000).contains(&default.len()) && mcmc.len() == 2500, "{} {}", default.len(), mcmc.len());
     let margin = default_db.min(mcmc_db) - none_db;
     assert!(margin > 1.0, "{none_db:.2} dB without, {default_db:.2} dB by default, {mcmc_db:.2} dB with MCMC");
 }

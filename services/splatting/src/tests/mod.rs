@@ -6,6 +6,7 @@ mod edges;
 mod forward;
 mod gradients;
 mod harmonics;
+mod hostile;
 mod statistics;
 mod training;
 
