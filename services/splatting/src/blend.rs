@@ -93,15 +93,9 @@ pub(crate) fn block_pixels<S: Simd>(s: S, origin: [usize; 2], block: usize) -> (
     (s.load(&columns), s.load(&lines), by * TILE + bx)
 }
 
-/// dx, dy and alpha of one splat at 16 pixels; alpha is 0 where it does not count.
+/// Alpha of one splat at 16 pixels, and where it counts; it is 0 where it does not.
 #[inline(always)]
-pub(crate) fn alpha_at<S: Simd>(
-    s: S,
-    row: &[f32; 16],
-    px: S::F,
-    py: S::F,
-    alpha_min: S::F,
-) -> (S::F, S::F, S::F, S::M) {
+pub(crate) fn alpha_at<S: Simd>(s: S, row: &[f32; 16], px: S::F, py: S::F, alpha_min: S::F) -> (S::F, S::M) {
     let dx = s.sub(px, s.splat(row[X]));
     let dy = s.sub(py, s.splat(row[Y]));
     let along_x = s.fma(dy, s.splat(row[B2]), s.mul(dx, s.splat(row[A])));
@@ -110,7 +104,7 @@ pub(crate) fn alpha_at<S: Simd>(
     let exponent = s.fnma(dy, along_y, exponent);
     let alpha = s.exp2_fast(exponent);
     let counts = s.ge(alpha, alpha_min);
-    (dx, dy, s.keep(counts, alpha), counts)
+    (s.keep(counts, alpha), counts)
 }
 
 impl Kernel for BlendTile<'_> {
@@ -234,10 +228,7 @@ impl BlendTile<'_> {
         }
         for (step, four) in list.chunks_exact(TOGETHER).enumerate() {
             let rows = build!(&rows[0].0; TOGETHER; |j| &rows[four[j] as usize].0);
-            let alphas = build!((limit, s.mask(0)); TOGETHER; |j| {
-                let (_, _, alpha, counts) = alpha_at(s, rows[j], px, py, alpha_min);
-                (alpha, counts)
-            });
+            let alphas = build!((limit, s.mask(0)); TOGETHER; |j| alpha_at(s, rows[j], px, py, alpha_min));
             for j in 0..TOGETHER {
                 let weight = s.mul(transmittance, alphas[j].0);
                 transmittance = s.sub(transmittance, weight);

@@ -62,6 +62,21 @@ pub struct MomentsView {
     pub reference_m: f32,
 }
 
+/// How much the last training step had to do, for benchmarks.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Work {
+    /// Gaussians of the model.
+    pub gaussians: usize,
+    /// Gaussians that may touch the image.
+    pub visible: usize,
+    /// Pairs of a tile and a splat that may touch it.
+    pub entries: usize,
+    /// Pairs of a 4x4 block and a splat that changed one of its pixels.
+    pub contributions: usize,
+    /// Pixels of the view.
+    pub pixels: usize,
+}
+
 /// Why an engine could not be made or did not finish.
 #[derive(Debug, Error)]
 pub enum EngineError {
@@ -97,8 +112,10 @@ pub struct Engine {
     pub(crate) ssim_scratch: PerWorker<ssim::Scratch>,
     pub(crate) contributors: Vec<Contributors>,
     pub(crate) loss: LossImages,
-    pub(crate) slots: Vec<Lanes>,
-    pub(crate) touched: Vec<u8>,
+    /// Gradient moments of every (tile, splat), tile after tile in the order of its list.
+    pub(crate) sums: Vec<Lanes>,
+    /// Where in `sums` each slot's moments are.
+    pub(crate) places: Vec<u32>,
     pub(crate) corrections: Corrections,
     singles: PerWorker<Single>,
     pub(crate) stage_times: [Duration; 7],
@@ -127,8 +144,8 @@ impl Engine {
             ssim_scratch: PerWorker::new(&workers),
             contributors: Vec::new(),
             loss: LossImages::default(),
-            slots: Vec::new(),
-            touched: Vec::new(),
+            sums: Vec::new(),
+            places: Vec::new(),
             corrections: Corrections::default(),
             singles: PerWorker::new(&workers),
             stage_times: [Duration::ZERO; 7],
@@ -150,6 +167,19 @@ impl Engine {
     /// projection with Adam. For benchmarks and health figures; nothing depends on it.
     pub fn stage_times(&self) -> [Duration; 7] {
         self.stage_times
+    }
+
+    /// What the last training step had to do.
+    pub fn work(&self) -> Work {
+        let tiles = self.frame.tiles();
+        let contributors = self.contributors.iter().take(tiles);
+        Work {
+            gaussians: self.frame.rows.len(),
+            visible: self.frame.visible.iter().map(|lanes| lanes.count_ones() as usize).sum(),
+            entries: self.frame.entries.len(),
+            contributions: contributors.flat_map(|c| &c.lists).map(Vec::len).sum(),
+            pixels: tiles * TILE * TILE,
+        }
     }
 
     /// Renders colour, alpha and expected depth. Broken Gaussians (not finite, absurdly large) are left out; a camera

@@ -10,7 +10,7 @@ use crate::camera::{Camera, RenderSettings};
 use crate::model::{Gaussians, LANES, Lanes};
 use crate::projection::{View, project};
 use crate::sh;
-use crate::simd::{Isa, Kernel, Simd, dispatch};
+use crate::simd::{Isa, Kernel, Simd, build, dispatch};
 use crate::sort::{Item, sort_by_key};
 use crate::workers::{Shared, Workers};
 
@@ -33,7 +33,6 @@ pub(crate) const C: usize = 4;
 pub(crate) const LOG2_ALPHA: usize = 5;
 /// Red, green, blue, depth, or what else is blended.
 pub(crate) const CHANNELS: usize = 6;
-pub(crate) const DEPTH: usize = 9;
 /// Largest exponent that still counts.
 pub(crate) const THRESHOLD: usize = 10;
 /// B/A and B/C, for the nearest point of a block.
@@ -111,7 +110,8 @@ pub(crate) struct Frame {
     chunks: Vec<Chunk>,
     items: Vec<Item>,
     sorted: Vec<Item>,
-    counts: Vec<u32>,
+    counts: Vec<i32>,
+    next: Vec<u32>,
 }
 
 impl Frame {
@@ -210,42 +210,83 @@ impl Frame {
         let part_length = self.items.len().div_ceil(parts).max(1);
         let items = &self.items;
         let part = |p: usize| &items[(p * part_length).min(items.len())..((p + 1) * part_length).min(items.len())];
+        // Boxes are counted by their corners: sums along both axes make of these the boxes over each tile.
+        let stride = tiles_x + 1;
+        let corners = stride * (self.tiles_y + 1);
         self.counts.clear();
-        self.counts.resize(parts * tiles, 0);
+        self.counts.resize(parts * corners, 0);
         let counts = Shared::new(&mut self.counts);
         workers.run(parts, |_, p| {
             // SAFETY: one range of counters per part.
-            let counts = unsafe { counts.slice_mut(p * tiles..(p + 1) * tiles) };
+            let counts = unsafe { counts.slice_mut(p * corners..(p + 1) * corners) };
             for item in part(p) {
-                item.for_each_tile(tiles_x, |tile| counts[tile] += 1);
+                let [x0, y0, x1, y1] = item.tiles();
+                let (top, bottom) = (y0 * stride, (y1 + 1) * stride);
+                for (at, change) in [(top + x0, 1), (top + x1 + 1, -1), (bottom + x0, -1), (bottom + x1 + 1, 1)] {
+                    counts[at] += change;
+                }
+            }
+            for row in counts.chunks_exact_mut(stride) {
+                let mut sum = 0;
+                for count in row {
+                    sum += *count;
+                    *count = sum;
+                }
+            }
+            for at in stride..corners {
+                counts[at] += counts[at - stride];
             }
         });
 
         self.starts.clear();
+        self.next.clear();
+        self.next.resize(parts * tiles, 0);
         let mut total = 0;
         for tile in 0..tiles {
             self.starts.push(total);
+            let corner = tile / tiles_x * stride + tile % tiles_x;
             for p in 0..parts {
-                let count = std::mem::replace(&mut self.counts[p * tiles + tile], total);
-                total += count;
+                self.next[p * tiles + tile] = total;
+                total += self.counts[p * corners + corner].cast_unsigned();
             }
         }
         self.starts.push(total);
-        self.entries.resize(total as usize, 0);
+        // Behind the entries is one place for each part's writes that count for nothing.
+        self.entries.resize(total as usize + parts, 0);
 
-        let counts = Shared::new(&mut self.counts);
+        let next = Shared::new(&mut self.next);
         let entries = Shared::new(&mut self.entries);
         workers.run(parts, |_, p| {
             // SAFETY: one range of counters per part.
-            let next = unsafe { counts.slice_mut(p * tiles..(p + 1) * tiles) };
+            let next = unsafe { next.slice_mut(p * tiles..(p + 1) * tiles) };
+            let nowhere = total + p as u32;
+            let mut append = |tile: usize, gaussian: u32, really: bool| {
+                let place = next[tile];
+                let place_or_nowhere = if really { place } else { nowhere };
+                // SAFETY: the prefix sums give every (tile, part) a range of its own, and every part a place behind all.
+                unsafe { entries.write(place_or_nowhere as usize, gaussian) };
+                next[tile] = place + u32::from(really);
+            };
             for item in part(p) {
-                item.for_each_tile(tiles_x, |tile| {
-                    // SAFETY: the prefix sums give every (tile, part) a range of its own.
-                    unsafe { entries.write(next[tile] as usize, item.gaussian) };
-                    next[tile] += 1;
-                });
+                let [x0, y0, x1, y1] = item.tiles();
+                if x1 - x0 > 1 || y1 - y0 > 1 {
+                    for y in y0..=y1 {
+                        for x in x0..=x1 {
+                            append(y * tiles_x + x, item.gaussian, true);
+                        }
+                    }
+                } else {
+                    // Most splats touch one, two or four tiles: without a branch, which would be mispredicted.
+                    let (right, below) = (x1 > x0, y1 > y0);
+                    let (top, bottom) = (y0 * tiles_x, y1 * tiles_x);
+                    append(top + x0, item.gaussian, true);
+                    append(top + x1, item.gaussian, right);
+                    append(bottom + x0, item.gaussian, below);
+                    append(bottom + x1, item.gaussian, right && below);
+                }
             }
         });
+        self.entries.truncate(total as usize);
         self.schedule.clear();
         self.schedule.extend(0..tiles as u32);
         let length = |t: u32| self.starts[t as usize + 1] - self.starts[t as usize];
@@ -260,7 +301,13 @@ impl Frame {
     /// Footprint of a visible Gaussian.
     #[inline(always)]
     pub(crate) fn footprint(&self, gaussian: usize) -> Footprint {
-        let row = &self.rows[gaussian].0;
+        self.footprint_of(gaussian, &self.rows[gaussian])
+    }
+
+    /// Footprint of a visible Gaussian whose row is at hand.
+    #[inline(always)]
+    pub(crate) fn footprint_of(&self, gaussian: usize, row: &Row) -> Footprint {
+        let row = &row.0;
         let (corner, extent) = (row[CORNER].to_bits(), row[EXTENT].to_bits());
         Footprint {
             slot: self.slot_bases[gaussian / CHUNK] + row[SLOT].to_bits() as usize,
@@ -316,7 +363,13 @@ impl Kernel for ProjectChunk<'_> {
             }
             let scale = s.splat(0.5 * std::f32::consts::LOG2_E);
             let [ca, cb, cc] = p.conic;
-            let zero = s.splat(0.0);
+            let per_tile = s.splat(1.0 / TILE as f32);
+            let tile = build!(per_tile; 4; |b| s.floor(s.mul(p.bounds[b], per_tile)));
+            // A splat between two pixel centres may have its last pixel before its first.
+            let (x0, y0) = (tile[0], tile[1]);
+            let (x1, y1) = (s.max(tile[2], x0), s.max(tile[3], y0));
+            let one = s.splat(1.0);
+            let (width, height) = (s.add(s.sub(x1, x0), one), s.add(s.sub(y1, y0), one));
             let mut columns = [
                 p.mean[0],
                 p.mean[1],
@@ -331,37 +384,32 @@ impl Kernel for ProjectChunk<'_> {
                 p.threshold,
                 s.div(cb, ca),
                 s.div(cb, cc),
-                zero,
-                zero,
-                zero,
+                one,
+                s.pack_u16(x0, y0),
+                s.pack_u16(width, height),
             ];
             s.transpose(&mut columns);
-            let mut bounds = [[0.0; LANES]; 4];
-            for (to, from) in bounds.iter_mut().zip(p.bounds) {
-                s.store(from, to);
-            }
+            let (mut first, mut last, mut depths, mut tiles) = ([0.0; LANES], [0.0; LANES], [0.0; LANES], [0.0; LANES]);
+            s.store(s.pack_u16(x0, y0), &mut first);
+            s.store(s.pack_u16(x1, y1), &mut last);
+            s.store(p.z, &mut depths);
+            s.store(s.mul(width, height), &mut tiles);
             let mut bits = bits;
             while bits != 0 {
                 let lane = bits.trailing_zeros() as usize;
                 bits &= bits - 1;
                 let row = &mut self.rows[i * LANES + lane].0;
                 s.store(columns[lane], row);
-                let tile = |b: usize| (bounds[b][lane] as usize / TILE) as u32;
-                let (x0, y0) = (tile(0), tile(1));
-                // A splat between two pixel centres may have its last pixel before its first.
-                let (x1, y1) = (tile(2).max(x0), tile(3).max(y0));
-                let (width, height) = (x1 - x0 + 1, y1 - y0 + 1);
                 row[SLOT] = f32::from_bits(chunk.slots as u32);
-                row[CORNER] = f32::from_bits(x0 | y0 << 16);
-                row[EXTENT] = f32::from_bits(width | height << 16);
-                let key = row[DEPTH].to_bits();
+                let key = depths[lane].to_bits();
                 self.items[chunk.items] = Item {
                     key,
                     gaussian: (block * LANES + lane) as u32,
-                    tiles: [x0 as u16, y0 as u16, x1 as u16, y1 as u16],
+                    first: first[lane].to_bits(),
+                    last: last[lane].to_bits(),
                 };
                 chunk.items += 1;
-                chunk.slots += (width * height) as usize;
+                chunk.slots += tiles[lane] as usize;
                 chunk.key_min = chunk.key_min.min(key);
                 chunk.key_max = chunk.key_max.max(key);
             }

@@ -1,6 +1,7 @@
 //! From moments per splat to gradients per parameter: the projection, backwards.
 
 use crate::backward::MOMENTS;
+use crate::blend::prefetch;
 use crate::frame::Frame;
 use crate::frame::Row;
 use crate::model::{
@@ -25,14 +26,28 @@ pub(crate) struct BlockGradient<S: Simd> {
     pub scales: [S::F; 3],
 }
 
+/// Place of a slot whose tile the splat changed nothing in.
+pub(crate) const UNTOUCHED: u32 = u32::MAX;
+/// How many slots ahead sums are asked for: those of neighbours are apart, in the depth order of their tiles.
+const AHEAD: usize = 48;
+
+/// What the backward blend left behind.
+#[derive(Clone, Copy)]
+pub(crate) struct Partials<'a> {
+    /// Moments of every (tile, splat), tile after tile.
+    pub sums: &'a [Row],
+    /// For every slot, where its moments are, or [`UNTOUCHED`].
+    pub places: &'a [u32],
+}
+
 /// Sums a block's partials over tiles, in the order of the tiles, and takes them through the projection. `rest` are the
-/// rows of higher bands that are evaluated.
+/// rows of higher bands that are evaluated; without `BANDS`, which costs nothing then, there are none.
 #[inline(always)]
-pub(crate) fn block_gradient<S: Simd>(
+pub(crate) fn block_gradient<S: Simd, const BANDS: bool>(
     s: S,
     view: &View,
     frame: &Frame,
-    (slots, touched): (&[Row], &[u8]),
+    partials: Partials<'_>,
     block_index: usize,
     (block, rest): (&Block, &[Lanes]),
 ) -> Option<BlockGradient<S>> {
@@ -46,9 +61,13 @@ pub(crate) fn block_gradient<S: Simd>(
         bits &= bits - 1;
         let footprint = frame.footprint(block_index * LANES + lane);
         let range = footprint.slot..footprint.slot + footprint.width * footprint.height;
-        for (slot, &touched) in slots[range.clone()].iter().zip(&touched[range]) {
-            if touched != 0 {
-                rows[lane] = s.add(rows[lane], s.load(&slot.0));
+        for slot in range {
+            if let Some(&next) = partials.places.get(slot + AHEAD) {
+                prefetch(partials.sums.get(next as usize));
+            }
+            let place = partials.places[slot];
+            if place != UNTOUCHED {
+                rows[lane] = s.add(rows[lane], s.load(&partials.sums[place as usize].0));
                 drawn |= 1 << lane;
             }
         }
@@ -61,7 +80,7 @@ pub(crate) fn block_gradient<S: Simd>(
     let projected = project(s, view, block, drawn);
     let mut rows = parameter_gradients(s, view, &projected, &moments);
     let mut bands = None;
-    if !rest.is_empty() {
+    if BANDS {
         let d_color = [moments[6], moments[7], moments[8]];
         bands = Some(sh::bands_gradient(s, view, block, rest, &d_color, &mut rows[ROW_MEAN..]));
     }

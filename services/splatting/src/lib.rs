@@ -33,7 +33,7 @@ mod view;
 mod workers;
 
 pub use camera::{Camera, Pose, RenderSettings};
-pub use engine::{DEPTH_ALPHA_TINY, Engine, EngineError, Moments, MomentsView, Rendered};
+pub use engine::{DEPTH_ALPHA_TINY, Engine, EngineError, Moments, MomentsView, Rendered, Work};
 pub use formats::ply;
 pub use model::{Gaussian, Gaussians, SH_C0, SH_DEGREE_MAX, SH_REST_MAX, sh_rest_coefficients};
 pub use optimiser::Optimiser;

@@ -62,7 +62,7 @@ pub fn ssim(a: &[[f32; 3]], b: &[[f32; 3]], width: usize, height: usize, mask: O
     (count > 0).then(|| sum / count as f64)
 }
 
-fn blur(values: &[f64], width: usize, height: usize) -> Vec<f64> {
+pub(crate) fn blur(values: &[f64], width: usize, height: usize) -> Vec<f64> {
     let window = window().map(f64::from);
     let radius = window.len() / 2;
     let pass = |from: &[f64], step: usize, position: &dyn Fn(usize) -> (usize, usize)| -> Vec<f64> {

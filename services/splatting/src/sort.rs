@@ -12,24 +12,21 @@ const DIGITS: usize = 1 << DIGIT_BITS;
 /// Below this many items the passes run on one thread: waking another costs more.
 const PARALLEL_FROM: usize = 8192;
 
-/// A visible splat: its depth's bits, its index, and the tiles of its bounding box (first x, y, last x, y).
+/// A visible splat: its depth's bits, its index, and the corners of its bounding box in tiles, x | y << 16.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[repr(C, align(16))]
 pub(crate) struct Item {
     pub key: u32,
     pub gaussian: u32,
-    pub tiles: [u16; 4],
+    pub first: u32,
+    pub last: u32,
 }
 
 impl Item {
-    /// Calls `f` with the index of each tile of the bounding box.
+    /// First x and y, last x and y of the bounding box, in tiles.
     #[inline(always)]
-    pub(crate) fn for_each_tile(&self, tiles_x: usize, mut f: impl FnMut(usize)) {
-        let [x0, y0, x1, y1] = self.tiles.map(usize::from);
-        for y in y0..=y1 {
-            for x in x0..=x1 {
-                f(y * tiles_x + x);
-            }
-        }
+    pub(crate) fn tiles(&self) -> [usize; 4] {
+        [self.first & 0xffff, self.first >> 16, self.last & 0xffff, self.last >> 16].map(|t| t as usize)
     }
 }
 
@@ -93,7 +90,7 @@ mod tests {
         let items: Vec<Item> = depths
             .iter()
             .enumerate()
-            .map(|(i, d)| Item { key: d.to_bits(), gaussian: i as u32, tiles: [0; 4] })
+            .map(|(i, d)| Item { key: d.to_bits(), gaussian: i as u32, first: 0, last: 0 })
             .collect();
         let mut expected = items.clone();
         expected.sort_by_key(|item| item.key >> 1);
@@ -122,7 +119,7 @@ mod tests {
     fn nothing_and_one_item_are_sorted() {
         let workers = Workers::sequential();
         sort_by_key(&workers, &mut [], &mut [], 0, 0);
-        let mut one = [Item { key: 7, gaussian: 3, tiles: [1; 4] }];
+        let mut one = [Item { key: 7, gaussian: 3, first: 1, last: 1 }];
         sort_by_key(&workers, &mut one, &mut [Item::default()], 7, 7);
         assert_eq!(one[0].gaussian, 3);
     }

@@ -4,10 +4,10 @@
 
 use std::time::Instant;
 
-use crate::backward::BackwardTile;
+use crate::backward::{BackwardTile, TOUCHED};
 use crate::engine::Engine;
-use crate::frame::{Frame, Row, TILE};
-use crate::gradient::{BlockGradient, block_gradient};
+use crate::frame::{Frame, TILE};
+use crate::gradient::{BlockGradient, Partials, UNTOUCHED, block_gradient};
 use crate::loss;
 use crate::model::{Block, Gaussians, LANES, Lanes, ROW_LOG_SCALE, ROW_SH, ROWS, SH_C0, SH_REST_MAX, sh_rest_rows};
 use crate::optimiser::{AdamStep, Optimiser};
@@ -86,7 +86,15 @@ impl Engine {
                 }
             };
             // SAFETY: one task per chunk.
-            unsafe { results.write(chunk, dispatch(self.isa, kernel)) };
+            unsafe {
+                results.write(
+                    chunk,
+                    match pass.sh_rows {
+                        0 => dispatch(self.isa, WithBands::<false, _>(kernel)),
+                        _ => dispatch(self.isa, WithBands::<true, _>(kernel)),
+                    },
+                );
+            };
         });
         self.stage_times[6] = accumulated.elapsed();
         finish(terms, &isotropic, gaussians.len(), settings)
@@ -123,7 +131,7 @@ impl Engine {
         (finish(terms, &isotropic, gaussians.len(), settings), out)
     }
 
-    /// Renders the view, evaluates the loss, and leaves the moments of every (tile, Gaussian) in the slots.
+    /// Renders the view, evaluates the loss, and leaves the moments of every (tile, Gaussian) in the sums.
     fn accumulate(&mut self, gaussians: &Gaussians, view: &TrainingView, settings: &TrainingSettings) -> LossTerms {
         let camera = view.camera();
         let start = Instant::now();
@@ -147,38 +155,43 @@ impl Engine {
 
     pub(crate) fn backward(&mut self, settings: &TrainingSettings) {
         let frame = &self.frame;
-        if self.slots.len() < frame.slots {
+        // Every tile has one more sum than entries, for the row that fills up its kernel's last step.
+        let length = frame.entries.len() + frame.tiles();
+        if self.sums.len() < length {
             // A quarter more than needed: the number changes from view to view.
-            self.slots.resize(frame.slots + frame.slots / 4, Lanes([0.0; LANES]));
+            self.sums.resize(length + length / 4, Lanes([0.0; LANES]));
         }
-        self.touched.clear();
-        self.touched.resize(frame.slots, 0);
-        let slots = Shared::new(&mut self.slots);
-        let touched = Shared::new(&mut self.touched);
+        self.places.clear();
+        self.places.resize(frame.slots, UNTOUCHED);
+        let sums = Shared::new(&mut self.sums);
+        let places = Shared::new(&mut self.places);
         self.workers.run(frame.tiles(), |worker, task| {
             let tile = frame.schedule[task] as usize;
             let (tile_x, tile_y) = (tile % frame.tiles_x, tile / frame.tiles_x);
             let entries = frame.tile_entries(tile);
+            let first = frame.starts[tile] as usize + tile;
+            // SAFETY: the ranges of different tiles do not overlap, and each tile is given to one task.
+            let sums = unsafe { sums.slice_mut(first..first + entries.len() + 1) };
             self.backward_scratch.with(worker, |scratch| {
+                let contributors = &self.contributors[tile];
                 let kernel = BackwardTile {
                     origin: [tile_x * TILE, tile_y * TILE],
                     entries,
                     rows: &frame.rows,
-                    contributors: &self.contributors[tile],
+                    contributors,
                     pixels: &frame.pixels[tile],
                     gradients: &self.loss.gradients[tile],
                     alpha_min: settings.render.alpha_min,
-                    scratch,
+                    scratch: &mut *scratch,
+                    sums: &mut *sums,
                 };
                 dispatch(self.isa, kernel);
-                for ((&gaussian, sum), &has) in entries.iter().zip(&scratch.sums).zip(&scratch.touched) {
-                    if has {
-                        let slot = frame.footprint(gaussian as usize).slot_in(tile_x, tile_y);
+                let used = entries.iter().take(contributors.used).zip(sums).zip(&scratch.rows);
+                for (i, ((&gaussian, sum), row)) in used.enumerate() {
+                    if sum.0[TOUCHED] > 0.0 {
+                        let slot = frame.footprint_of(gaussian as usize, row).slot_in(tile_x, tile_y);
                         // SAFETY: every (tile, Gaussian) has a slot of its own, and each tile is given to one task.
-                        unsafe {
-                            slots.write(slot, *sum);
-                            touched.write(slot, 1);
-                        }
+                        unsafe { places.write(slot, (first + i) as u32) };
                     }
                 }
             });
@@ -196,8 +209,7 @@ fn finish(terms: LossTerms, isotropic: &[f64], count: usize, settings: &Training
 struct ParameterPass<'a> {
     view: View,
     frame: &'a Frame,
-    slots: &'a [Row],
-    touched: &'a [u8],
+    partials: Partials<'a>,
     /// Rows of the higher bands that are evaluated.
     sh_rows: usize,
     /// Isotropic weight divided by the number of standard deviations of the model.
@@ -209,8 +221,7 @@ impl<'a> ParameterPass<'a> {
         Self {
             view: View::new(view.camera(), &settings.render),
             frame: &engine.frame,
-            slots: &engine.slots,
-            touched: &engine.touched,
+            partials: Partials { sums: &engine.sums, places: &engine.places },
             sh_rows: model.active_sh_rows(settings.render.sh_degree),
             isotropic: settings.isotropic_weight / (3 * model.len().max(1)) as f32,
         }
@@ -218,9 +229,13 @@ impl<'a> ParameterPass<'a> {
 
     /// Gradient of one block with the regulariser, and the regulariser's sum |s - mean(s)|.
     #[inline(always)]
-    fn block<S: Simd>(&self, s: S, index: usize, block: (&Block, &[Lanes])) -> Option<(BlockGradient<S>, f64)> {
-        let partials = (self.slots, self.touched);
-        let mut gradient = block_gradient(s, &self.view, self.frame, partials, index, block)?;
+    fn block<S: Simd, const BANDS: bool>(
+        &self,
+        s: S,
+        index: usize,
+        block: (&Block, &[Lanes]),
+    ) -> Option<(BlockGradient<S>, f64)> {
+        let mut gradient = block_gradient::<S, BANDS>(s, &self.view, self.frame, self.partials, index, block)?;
         let mut sum = 0.0;
         if self.isotropic != 0.0 {
             let third = s.splat(1.0 / 3.0);
@@ -254,24 +269,31 @@ struct AdamChunk<'a> {
     second_rest: &'a mut [Lanes],
 }
 
-impl Kernel for AdamChunk<'_> {
+/// A kernel compiled with and without higher bands: at degree 0 they must not cost a register.
+struct WithBands<const BANDS: bool, K>(K);
+
+impl<const BANDS: bool> Kernel for WithBands<BANDS, AdamChunk<'_>> {
     type Output = f64;
 
     #[inline(always)]
     fn run<S: Simd>(self, s: S) -> f64 {
+        let chunk = self.0;
         let mut isotropic = 0.0;
-        let state = self.first.iter_mut().zip(self.second).zip(self.steps.chunks_mut(LANES));
-        for (i, (block, ((first, second), steps))) in self.blocks.iter_mut().zip(state).enumerate() {
-            let bands = i * self.rest_rows..i * self.rest_rows + self.pass.sh_rows;
-            let rest = &mut self.rest[bands.clone()];
-            if let Some((gradient, sum)) = self.pass.block(s, self.start + i, (block, rest)) {
-                isotropic += sum;
-                let corrections = self.adam.apply(s, &gradient.rows, gradient.lanes, block, (first, second, steps));
-                if let Some(basis) = &gradient.bands {
-                    let moments = (&mut self.first_rest[bands.clone()], &mut self.second_rest[bands]);
-                    let lanes = (gradient.lanes, &corrections);
-                    self.adam.apply_rest(s, (&gradient.rows, basis), lanes, rest, moments);
-                }
+        let state = chunk.first.iter_mut().zip(chunk.second).zip(chunk.steps.chunks_mut(LANES));
+        for (i, (block, ((first, second), steps))) in chunk.blocks.iter_mut().zip(state).enumerate() {
+            let bands = match BANDS {
+                true => i * chunk.rest_rows..i * chunk.rest_rows + chunk.pass.sh_rows,
+                false => 0..0,
+            };
+            let rest = &mut chunk.rest[bands.clone()];
+            let Some((gradient, sum)) = chunk.pass.block::<S, BANDS>(s, chunk.start + i, (block, rest)) else {
+                continue;
+            };
+            isotropic += sum;
+            let corrections = chunk.adam.apply(s, &gradient.rows, gradient.lanes, block, (first, second, steps));
+            if let Some(basis) = &gradient.bands {
+                let moments = (&mut chunk.first_rest[bands.clone()], &mut chunk.second_rest[bands]);
+                chunk.adam.apply_rest(s, (&gradient.rows, basis), (gradient.lanes, &corrections), rest, moments);
             }
         }
         isotropic
@@ -291,7 +313,7 @@ impl Kernel for GradientBlock<'_> {
     #[inline(always)]
     fn run<S: Simd>(self, s: S) -> Self::Output {
         let (mut out, mut bands) = (Block::ZERO, [Lanes([0.0; LANES]); 3 * SH_REST_MAX]);
-        let Some((gradient, sum)) = self.pass.block(s, self.index, (self.block, self.rest)) else {
+        let Some((gradient, sum)) = self.pass.block::<S, true>(s, self.index, (self.block, self.rest)) else {
             return (out, bands, 0.0);
         };
         for (to, row) in out.0.iter_mut().zip(gradient.rows) {

@@ -130,7 +130,10 @@ pub enum ReadError {
 /// Those of the writer; a model that is not finite, or beyond what the format holds.
 pub fn write(format: Format, gaussians: &Gaussians, antialiased: bool, to: &mut impl Write) -> Result<(), WriteError> {
     match format {
-        Format::Ply => ply::write(gaussians, to),
+        Format::Ply => {
+            check_finite(gaussians)?;
+            Ok(ply::write_checked(gaussians, to)?)
+        }
         Format::Splat => splat::write(gaussians, to),
         Format::Spz => spz::write(gaussians, antialiased, to),
         Format::Glb => glb::write(gaussians, to),

@@ -38,45 +38,37 @@ macro_rules! with_avx2 {
 /// Lanes 0 to 7 and 8 to 15.
 type Pair = (__m256, __m256);
 
-/// Sums of pairs of numbers of a and b, interleaved.
-#[inline(always)]
-fn pair(_proof: Avx2, a: __m256, b: __m256) -> __m256 {
-    with_avx2!(_mm256_add_ps(_mm256_unpacklo_ps(a, b), _mm256_unpackhi_ps(a, b)))
-}
-
-/// Sums over the 128-bit lanes of four vectors from two results of `pair`.
-#[inline(always)]
-fn quad(_proof: Avx2, ab: __m256, cd: __m256) -> __m256 {
-    with_avx2!({
-        let (ab, cd) = (_mm256_castps_pd(ab), _mm256_castps_pd(cd));
-        _mm256_add_ps(_mm256_castpd_ps(_mm256_unpacklo_pd(ab, cd)), _mm256_castpd_ps(_mm256_unpackhi_pd(ab, cd)))
-    })
-}
-
 /// Sums of the two 128-bit lanes of x and of y.
 #[inline(always)]
 fn lanes(_proof: Avx2, x: __m256, y: __m256) -> __m256 {
     with_avx2!(_mm256_add_ps(_mm256_permute2f128_ps::<0x20>(x, y), _mm256_permute2f128_ps::<0x31>(x, y)))
 }
 
+/// Transposes the 4x4 numbers in each half of four vectors.
+#[inline(always)]
+fn transpose_4(_proof: Avx2, r: [__m256; 4]) -> [__m256; 4] {
+    with_avx2!({
+        let ab_low = _mm256_castps_pd(_mm256_unpacklo_ps(r[0], r[1]));
+        let ab_high = _mm256_castps_pd(_mm256_unpackhi_ps(r[0], r[1]));
+        let cd_low = _mm256_castps_pd(_mm256_unpacklo_ps(r[2], r[3]));
+        let cd_high = _mm256_castps_pd(_mm256_unpackhi_ps(r[2], r[3]));
+        [
+            _mm256_castpd_ps(_mm256_unpacklo_pd(ab_low, cd_low)),
+            _mm256_castpd_ps(_mm256_unpackhi_pd(ab_low, cd_low)),
+            _mm256_castpd_ps(_mm256_unpacklo_pd(ab_high, cd_high)),
+            _mm256_castpd_ps(_mm256_unpackhi_pd(ab_high, cd_high)),
+        ]
+    })
+}
+
 /// Transposes eight rows of eight numbers.
 #[inline(always)]
-fn transpose_8(_proof: Avx2, r: [__m256; 8]) -> [__m256; 8] {
+fn transpose_8(proof: Avx2, r: [__m256; 8]) -> [__m256; 8] {
     with_avx2!({
-        let mut t = r;
-        for g in 0..2 {
-            let (a, b, c, d) = (r[4 * g], r[4 * g + 1], r[4 * g + 2], r[4 * g + 3]);
-            let ab_low = _mm256_castps_pd(_mm256_unpacklo_ps(a, b));
-            let ab_high = _mm256_castps_pd(_mm256_unpackhi_ps(a, b));
-            let cd_low = _mm256_castps_pd(_mm256_unpacklo_ps(c, d));
-            let cd_high = _mm256_castps_pd(_mm256_unpackhi_ps(c, d));
-            t[4 * g] = _mm256_castpd_ps(_mm256_unpacklo_pd(ab_low, cd_low));
-            t[4 * g + 1] = _mm256_castpd_ps(_mm256_unpackhi_pd(ab_low, cd_low));
-            t[4 * g + 2] = _mm256_castpd_ps(_mm256_unpacklo_pd(ab_high, cd_high));
-            t[4 * g + 3] = _mm256_castpd_ps(_mm256_unpackhi_pd(ab_high, cd_high));
-        }
-        let low = build!(t[0]; 4; |i| _mm256_permute2f128_ps::<0x20>(t[i], t[4 + i]));
-        let high = build!(t[0]; 4; |i| _mm256_permute2f128_ps::<0x31>(t[i], t[4 + i]));
+        let (top, bottom) =
+            (transpose_4(proof, [r[0], r[1], r[2], r[3]]), transpose_4(proof, [r[4], r[5], r[6], r[7]]));
+        let low = build!(r[0]; 4; |i| _mm256_permute2f128_ps::<0x20>(top[i], bottom[i]));
+        let high = build!(r[0]; 4; |i| _mm256_permute2f128_ps::<0x31>(top[i], bottom[i]));
         [low[0], low[1], low[2], low[3], high[0], high[1], high[2], high[3]]
     })
 }
@@ -99,6 +91,15 @@ fn take_apart(_proof: Avx2, x: __m256) -> (__m256, __m256) {
         let fraction = _mm256_and_si256(bits, _mm256_set1_epi32(0x007f_ffff));
         let mantissa = _mm256_or_si256(fraction, _mm256_set1_epi32(0x3f80_0000));
         (_mm256_cvtepi32_ps(exponent), _mm256_castsi256_ps(mantissa))
+    })
+}
+
+/// Bits a | b << 16 of whole numbers.
+#[inline(always)]
+fn pack_u16(_proof: Avx2, a: __m256, b: __m256) -> __m256 {
+    with_avx2!({
+        let high = _mm256_slli_epi32::<16>(_mm256_cvttps_epi32(b));
+        _mm256_castsi256_ps(_mm256_or_si256(_mm256_cvttps_epi32(a), high))
     })
 }
 
@@ -201,6 +202,14 @@ impl Simd for Avx2 {
         with_avx2!((_mm256_andnot_ps(sign.0, a.0), _mm256_andnot_ps(sign.1, a.1)))
     }
     #[inline(always)]
+    fn floor(self, a: Pair) -> Pair {
+        with_avx2!((_mm256_floor_ps(a.0), _mm256_floor_ps(a.1)))
+    }
+    #[inline(always)]
+    fn pack_u16(self, a: Pair, b: Pair) -> Pair {
+        (pack_u16(self, a.0, b.0), pack_u16(self, a.1, b.1))
+    }
+    #[inline(always)]
     fn ge(self, a: Pair, b: Pair) -> Pair {
         with_avx2!((_mm256_cmp_ps::<_CMP_GE_OQ>(a.0, b.0), _mm256_cmp_ps::<_CMP_GE_OQ>(a.1, b.1)))
     }
@@ -256,13 +265,45 @@ impl Simd for Avx2 {
         }
     }
     #[inline(always)]
-    fn sum_rows_10(self, rows: &[Pair; 10]) -> Pair {
-        let r = build!(rows[0].0; 10; |i| with_avx2!(_mm256_add_ps(rows[i].0, rows[i].1)));
-        let zero = self.splat(0.0).0;
-        let abcd = quad(self, pair(self, r[0], r[1]), pair(self, r[2], r[3]));
-        let efgh = quad(self, pair(self, r[4], r[5]), pair(self, r[6], r[7]));
-        let ij = quad(self, pair(self, r[8], r[9]), zero);
-        (lanes(self, abcd, efgh), lanes(self, ij, zero))
+    fn splat_four(self, x: [f32; 4]) -> Pair {
+        let x = with_avx2!(_mm256_set_m128(_mm_setr_ps(x[0], x[1], x[2], x[3]), _mm_setr_ps(x[0], x[1], x[2], x[3])));
+        (x, x)
+    }
+    #[inline(always)]
+    fn transpose_groups(self, x: [Pair; 4]) -> [Pair; 4] {
+        let low = transpose_4(self, build!(x[0].0; 4; |i| x[i].0));
+        let high = transpose_4(self, build!(x[0].0; 4; |i| x[i].1));
+        build!(x[0]; 4; |i| (low[i], high[i]))
+    }
+    #[inline(always)]
+    fn sum_groups(self, x: [Pair; 4]) -> Pair {
+        let x = build!(x[0].0; 4; |i| with_avx2!(_mm256_add_ps(x[i].0, x[i].1)));
+        (lanes(self, x[0], x[1]), lanes(self, x[2], x[3]))
+    }
+    #[inline(always)]
+    fn rows_of_groups(self, x: [Pair; 3]) -> [Pair; 4] {
+        with_avx2!({
+            // Each half holds the groups (q, q + 1): a 4x4 transpose across the halves makes rows of them.
+            let groups = build!([_mm_setzero_ps(); 4]; 3; |m| {
+                let q = [
+                    _mm256_castps256_ps128(x[m].0),
+                    _mm256_extractf128_ps::<1>(x[m].0),
+                    _mm256_castps256_ps128(x[m].1),
+                    _mm256_extractf128_ps::<1>(x[m].1),
+                ];
+                let (ab_low, ab_high) = (_mm_unpacklo_ps(q[0], q[1]), _mm_unpackhi_ps(q[0], q[1]));
+                let (cd_low, cd_high) = (_mm_unpacklo_ps(q[2], q[3]), _mm_unpackhi_ps(q[2], q[3]));
+                [
+                    _mm_movelh_ps(ab_low, cd_low),
+                    _mm_movehl_ps(cd_low, ab_low),
+                    _mm_movelh_ps(ab_high, cd_high),
+                    _mm_movehl_ps(cd_high, ab_high),
+                ]
+            });
+            build!(x[0]; 4; |s| {
+                (_mm256_set_m128(groups[1][s], groups[0][s]), _mm256_set_m128(_mm_setzero_ps(), groups[2][s]))
+            })
+        })
     }
     #[inline(always)]
     fn append_hits<const N: usize>(

@@ -38,21 +38,6 @@ macro_rules! with_avx512 {
     };
 }
 
-/// Sums of pairs of numbers of a and b, interleaved.
-#[inline(always)]
-fn pair(_proof: Avx512, a: __m512, b: __m512) -> __m512 {
-    with_avx512!(_mm512_add_ps(_mm512_unpacklo_ps(a, b), _mm512_unpackhi_ps(a, b)))
-}
-
-/// Sums over the 128-bit lanes of four vectors from two results of `pair`.
-#[inline(always)]
-fn quad(_proof: Avx512, ab: __m512, cd: __m512) -> __m512 {
-    with_avx512!({
-        let (ab, cd) = (_mm512_castps_pd(ab), _mm512_castps_pd(cd));
-        _mm512_add_ps(_mm512_castpd_ps(_mm512_unpacklo_pd(ab, cd)), _mm512_castpd_ps(_mm512_unpackhi_pd(ab, cd)))
-    })
-}
-
 /// Sums of pairs of 128-bit lanes of x and of y.
 #[inline(always)]
 fn lanes(_proof: Avx512, x: __m512, y: __m512) -> __m512 {
@@ -142,6 +127,17 @@ impl Simd for Avx512 {
         with_avx512!(_mm512_abs_ps(a))
     }
     #[inline(always)]
+    fn floor(self, a: __m512) -> __m512 {
+        with_avx512!(_mm512_roundscale_ps::<0x09>(a))
+    }
+    #[inline(always)]
+    fn pack_u16(self, a: __m512, b: __m512) -> __m512 {
+        with_avx512!({
+            let high = _mm512_slli_epi32::<16>(_mm512_cvttps_epi32(b));
+            _mm512_castsi512_ps(_mm512_or_si512(_mm512_cvttps_epi32(a), high))
+        })
+    }
+    #[inline(always)]
     fn ge(self, a: __m512, b: __m512) -> __mmask16 {
         with_avx512!(_mm512_cmp_ps_mask::<_CMP_GE_OQ>(a, b))
     }
@@ -212,13 +208,45 @@ impl Simd for Avx512 {
         })
     }
     #[inline(always)]
-    fn sum_rows_10(self, r: &[__m512; 10]) -> __m512 {
+    fn splat_four(self, x: [f32; 4]) -> __m512 {
+        with_avx512!(_mm512_broadcast_f32x4(_mm_setr_ps(x[0], x[1], x[2], x[3])))
+    }
+    #[inline(always)]
+    fn transpose_groups(self, x: [__m512; 4]) -> [__m512; 4] {
         with_avx512!({
+            let ab_low = _mm512_castps_pd(_mm512_unpacklo_ps(x[0], x[1]));
+            let ab_high = _mm512_castps_pd(_mm512_unpackhi_ps(x[0], x[1]));
+            let cd_low = _mm512_castps_pd(_mm512_unpacklo_ps(x[2], x[3]));
+            let cd_high = _mm512_castps_pd(_mm512_unpackhi_ps(x[2], x[3]));
+            [
+                _mm512_castpd_ps(_mm512_unpacklo_pd(ab_low, cd_low)),
+                _mm512_castpd_ps(_mm512_unpackhi_pd(ab_low, cd_low)),
+                _mm512_castpd_ps(_mm512_unpacklo_pd(ab_high, cd_high)),
+                _mm512_castpd_ps(_mm512_unpackhi_pd(ab_high, cd_high)),
+            ]
+        })
+    }
+    #[inline(always)]
+    fn sum_groups(self, x: [__m512; 4]) -> __m512 {
+        lanes(self, lanes(self, x[0], x[1]), lanes(self, x[2], x[3]))
+    }
+    #[inline(always)]
+    fn rows_of_groups(self, x: [__m512; 3]) -> [__m512; 4] {
+        with_avx512!({
+            // Groups become rows inside each vector, then rows of the three vectors come together.
+            let turn = _mm512_setr_epi32(0, 4, 8, 12, 1, 5, 9, 13, 2, 6, 10, 14, 3, 7, 11, 15);
+            let x0 = _mm512_permutexvar_ps(turn, x[0]);
+            let x1 = _mm512_permutexvar_ps(turn, x[1]);
+            let x2 = _mm512_permutexvar_ps(turn, x[2]);
             let zero = _mm512_setzero_ps();
-            let abcd = quad(self, pair(self, r[0], r[1]), pair(self, r[2], r[3]));
-            let efgh = quad(self, pair(self, r[4], r[5]), pair(self, r[6], r[7]));
-            let ij = quad(self, pair(self, r[8], r[9]), zero);
-            lanes(self, lanes(self, abcd, efgh), lanes(self, ij, zero))
+            let (even, odd) = (_mm512_shuffle_f32x4::<0x88>(x0, x1), _mm512_shuffle_f32x4::<0xdd>(x0, x1));
+            let (even2, odd2) = (_mm512_shuffle_f32x4::<0x88>(x2, zero), _mm512_shuffle_f32x4::<0xdd>(x2, zero));
+            [
+                _mm512_shuffle_f32x4::<0x88>(even, even2),
+                _mm512_shuffle_f32x4::<0x88>(odd, odd2),
+                _mm512_shuffle_f32x4::<0xdd>(even, even2),
+                _mm512_shuffle_f32x4::<0xdd>(odd, odd2),
+            ]
         })
     }
     #[inline(always)]

@@ -1,7 +1,7 @@
 //! Sixteen-wide f32 arithmetic over `std::arch`, chosen at run time.
 //!
 //! Kernels are written once, generic over [`Simd`], and entered through [`dispatch`], which compiles each of them for
-//! AVX-512, for AVX2 with FMA and for plain Rust. Stable Rust, no `target-cpu` flags: a binary built anywhere uses what
+//! AVX-512, for AVX2 with FMA, for NEON (on 64-bit ARM) and for plain Rust. Stable Rust, no `target-cpu` flags: a binary built anywhere uses what
 //! the machine it runs on has. A value of an implementation is the proof that its instructions exist, so calling a
 //! method is safe.
 
@@ -9,6 +9,8 @@
 mod avx2;
 #[cfg(target_arch = "x86_64")]
 mod avx512;
+#[cfg(target_arch = "aarch64")]
+mod neon;
 mod portable;
 
 #[cfg(target_arch = "x86_64")]
@@ -23,14 +25,19 @@ pub enum Isa {
     Avx512,
     /// AVX2 and FMA: two registers per 16 lanes.
     Avx2,
+    /// NEON: four registers per 16 lanes.
+    Neon,
     /// Plain Rust, for every other machine: correct, and many times slower.
     Portable,
 }
 
 impl Isa {
+    /// Every set, the widest first.
+    pub const ALL: [Self; 4] = [Self::Avx512, Self::Avx2, Self::Neon, Self::Portable];
+
     /// The widest set this machine has.
     pub fn detect() -> Self {
-        [Self::Avx512, Self::Avx2].into_iter().find(|isa| isa.is_available()).unwrap_or(Self::Portable)
+        Self::ALL.into_iter().find(|isa| isa.is_available()).unwrap_or(Self::Portable)
     }
 
     /// Whether this machine can run the set.
@@ -42,6 +49,7 @@ impl Isa {
             Self::Avx2 => Avx2::detect().is_some(),
             #[cfg(not(target_arch = "x86_64"))]
             Self::Avx512 | Self::Avx2 => false,
+            Self::Neon => cfg!(target_arch = "aarch64"),
             Self::Portable => true,
         }
     }
@@ -66,6 +74,9 @@ pub(crate) fn dispatch<K: Kernel>(isa: Isa, kernel: K) -> K::Output {
             Some(s) => avx2::enter(s, kernel),
             None => kernel.run(Portable),
         },
+        // Part of the target: no function of its own is needed to enable it.
+        #[cfg(target_arch = "aarch64")]
+        Isa::Neon => kernel.run(neon::Neon),
         _ => kernel.run(Portable),
     }
 }
@@ -100,6 +111,10 @@ pub(crate) trait Simd: Copy {
     /// 1 / a to at least 14 bits, for a in the normal range.
     fn reciprocal_14(self, a: Self::F) -> Self::F;
     fn abs(self, a: Self::F) -> Self::F;
+    /// Largest whole number not above a.
+    fn floor(self, a: Self::F) -> Self::F;
+    /// Bits a | b << 16 of whole numbers from 0 to 65535; anything for other numbers.
+    fn pack_u16(self, a: Self::F, b: Self::F) -> Self::F;
 
     /// a >= b; false where one is NaN.
     fn ge(self, a: Self::F, b: Self::F) -> Self::M;
@@ -123,8 +138,56 @@ pub(crate) trait Simd: Copy {
 
     /// Transposes 16 rows of 16 lanes.
     fn transpose(self, rows: &mut [Self::F; 16]);
-    /// Lane i is the sum over the lanes of row i; lanes 10 to 15 are 0.
-    fn sum_rows_10(self, rows: &[Self::F; 10]) -> Self::F;
+    // Vectors as four groups of four lanes, the rows of a 4x4 block of pixels: lane 4 j + i is number i of group j. The
+    // defaults go through memory; an instruction set overrides what it is good at.
+
+    /// Number i in lane i of every group.
+    #[inline(always)]
+    fn splat_four(self, x: [f32; 4]) -> Self::F {
+        self.load(&build!(0.0; 16; |lane| x[lane % 4]))
+    }
+    /// Number j in all lanes of group j.
+    #[inline(always)]
+    fn splat_groups(self, x: [f32; 4]) -> Self::F {
+        self.load(&build!(0.0; 16; |lane| x[lane / 4]))
+    }
+    /// Number i of each group in all lanes of that group.
+    #[inline(always)]
+    fn spread(self, x: Self::F, i: usize) -> Self::F {
+        let mut lanes = [0.0; 16];
+        self.store(x, &mut lanes);
+        self.load(&build!(0.0; 16; |lane| lanes[lane / 4 * 4 + i % 4]))
+    }
+    /// Transposes the groups: lane s of group j of result i is lane i of group j of operand s.
+    #[inline(always)]
+    fn transpose_groups(self, x: [Self::F; 4]) -> [Self::F; 4] {
+        let mut from = [[0.0; 16]; 4];
+        for s in 0..4 {
+            self.store(x[s], &mut from[s]);
+        }
+        build!(x[0]; 4; |i| self.load(&build!(0.0; 16; |lane| from[lane % 4][lane / 4 * 4 + i])))
+    }
+    /// Adds up groups: lane s of group q is the sum over the groups j of lane s of operand q.
+    #[inline(always)]
+    fn sum_groups(self, x: [Self::F; 4]) -> Self::F {
+        let mut from = [[0.0; 16]; 4];
+        for q in 0..4 {
+            self.store(x[q], &mut from[q]);
+        }
+        self.load(&build!(0.0; 16; |lane| {
+            let (q, s) = (&from[lane / 4], lane % 4);
+            (q[s] + q[4 + s]) + (q[8 + s] + q[12 + s])
+        }))
+    }
+    /// Rows from columns: lane 4 m + q of result s is lane s of group q of operand m; lanes 12 to 15 are 0.
+    #[inline(always)]
+    fn rows_of_groups(self, x: [Self::F; 3]) -> [Self::F; 4] {
+        let mut from = [[0.0; 16]; 4];
+        for m in 0..3 {
+            self.store(x[m], &mut from[m]);
+        }
+        build!(x[0]; 4; |s| self.load(&build!(0.0; 16; |lane| from[lane / 4][lane % 4 * 4 + s])))
+    }
 
     /// Appends to list `b`, for each lane i with bit b of `hits[i]` set, the number `first + i`; counts follow. Up to 16
     /// numbers after the new end of each list may be overwritten.
@@ -240,8 +303,14 @@ mod tests {
             for (i, row) in rows.iter_mut().enumerate() {
                 *row = s.add(x, s.splat(100.0 * i as f32));
             }
-            let ten: [S::F; 10] = std::array::from_fn(|i| rows[i]);
-            let sums = s.sum_rows_10(&ten);
+            let groups = s.sum_groups([rows[0], rows[1], rows[2], rows[3]]);
+            let turned = s.transpose_groups([rows[0], rows[1], rows[2], rows[3]]);
+            let columns = s.rows_of_groups([rows[0], rows[1], rows[2]]);
+            let mut lanes = [0.0; 16];
+            s.store(x, &mut lanes);
+            let four = s.splat_four([lanes[0], lanes[1], lanes[2], lanes[3]]);
+            let by_group = s.splat_groups([lanes[0], lanes[1], lanes[2], lanes[3]]);
+            let spread = s.spread(x, 2);
             s.transpose(&mut rows);
             let mut image = vec![0.0; 64];
             s.store_4x4(x, &mut image, 5, 12);
@@ -254,11 +323,18 @@ mod tests {
                 s.log2(s.add(s.abs(x), s.splat(1e-6))),
                 s.reciprocal_14(s.add(s.abs(x), s.splat(0.1))),
                 rows[3],
-                sums,
+                groups,
+                turned[1],
+                columns[3],
+                four,
+                by_group,
+                spread,
                 block,
                 s.keep(again, x),
                 s.select(mask, s.splat(1.0), s.splat(-1.0)),
                 s.sqrt(s.abs(x)),
+                s.floor(x),
+                s.pack_u16(s.floor(s.abs(x)), s.splat(259.0)),
             ];
             check_append(s);
             out.iter()
@@ -290,18 +366,25 @@ mod tests {
 
     fn expected(x: [f32; 16]) -> Vec<[f32; 16]> {
         let map = |f: &dyn Fn(f64) -> f64| x.map(|v| f(f64::from(v)) as f32);
-        let sum: f64 = x.iter().map(|&v| f64::from(v)).sum();
+        let sum = |i: usize| (0..4).map(|j| f64::from(x[4 * j + i % 4])).sum::<f64>() + 400.0 * (i / 4) as f64;
         vec![
             map(&f64::exp2),
             map(&f64::exp2),
             map(&|v| (v.abs() + 1e-6).log2()),
             map(&|v| 1.0 / (v.abs() + 0.1)),
             std::array::from_fn(|i| x[3] + 100.0 * i as f32),
-            std::array::from_fn(|i| if i < 10 { (sum + 1600.0 * i as f64) as f32 } else { 0.0 }),
+            std::array::from_fn(|i| sum(i) as f32),
+            std::array::from_fn(|i| x[i / 4 * 4 + 1] + 100.0 * (i % 4) as f32),
+            std::array::from_fn(|i| if i < 12 { x[i % 4 * 4 + 3] + 100.0 * (i / 4) as f32 } else { 0.0 }),
+            std::array::from_fn(|i| x[i % 4]),
+            std::array::from_fn(|i| x[i / 4]),
+            std::array::from_fn(|i| x[i / 4 * 4 + 2]),
             x,
             x.map(|v| if v >= 0.5 { v } else { 0.0 }),
             x.map(|v| if v >= 0.5 { 1.0 } else { -1.0 }),
             map(&|v| v.abs().sqrt()),
+            map(&f64::floor),
+            x.map(|v| f32::from_bits(v.abs() as u32 | 259 << 16)),
         ]
     }
 
@@ -313,9 +396,9 @@ mod tests {
             std::array::from_fn(|i| -100.0 + 13.0 * i as f32),
         ];
         // Relative error allowed for each probe; the third is absolute near log2(1) = 0.
-        let tolerance = [4e-7, 6e-6, 3e-7, 1e-4, 1e-6, 1e-5, 0.0, 0.0, 0.0, 2e-7];
+        let tolerance = [4e-7, 6e-6, 3e-7, 1e-4, 1e-6, 1e-6, 1e-6, 1e-6, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 2e-7, 0.0, 0.0];
         let mut ran = 0;
-        for isa in [Isa::Avx512, Isa::Avx2, Isa::Portable].into_iter().filter(|isa| isa.is_available()) {
+        for isa in Isa::ALL.into_iter().filter(|isa| isa.is_available()) {
             for x in inputs {
                 let got = dispatch(isa, Probe(x));
                 for ((got, want), tolerance) in got.iter().zip(expected(x)).zip(tolerance) {
@@ -331,7 +414,7 @@ mod tests {
 
     #[test]
     fn exp2_underflows_to_zero() {
-        for isa in [Isa::Avx512, Isa::Avx2, Isa::Portable].into_iter().filter(|isa| isa.is_available()) {
+        for isa in Isa::ALL.into_iter().filter(|isa| isa.is_available()) {
             let got = dispatch(isa, Probe([-1e9; 16]));
             assert!(got[0].iter().chain(&got[1]).all(|v| v.abs() < 1e-37), "{isa:?}: {got:?}");
         }

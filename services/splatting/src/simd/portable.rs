@@ -89,6 +89,18 @@ impl Simd for Portable {
         a.map(f32::abs)
     }
     #[inline(always)]
+    fn floor(self, a: F16) -> F16 {
+        // Without SSE 4.1 the standard library's is a call.
+        a.map(|a| {
+            let towards_zero = a as i32 as f32;
+            if towards_zero > a { towards_zero - 1.0 } else { towards_zero }
+        })
+    }
+    #[inline(always)]
+    fn pack_u16(self, a: F16, b: F16) -> F16 {
+        zip(a, b, |a, b| f32::from_bits(a as u32 | (b as u32) << 16))
+    }
+    #[inline(always)]
     fn ge(self, a: F16, b: F16) -> u16 {
         compare(a, b, |a, b| a >= b)
     }
@@ -139,10 +151,6 @@ impl Simd for Portable {
     #[inline(always)]
     fn transpose(self, rows: &mut [F16; 16]) {
         *rows = std::array::from_fn(|i| std::array::from_fn(|j| rows[j][i]));
-    }
-    #[inline(always)]
-    fn sum_rows_10(self, rows: &[F16; 10]) -> F16 {
-        std::array::from_fn(|i| rows.get(i).map_or(0.0, |row| row.iter().sum()))
     }
     #[inline(always)]
     fn append_hits<const N: usize>(

@@ -30,7 +30,7 @@ fn check(model: &Gaussians, camera: &Camera) -> Vec<Pixel> {
             let color = pixel.color + (1.0 - pixel.alpha) * 0.5;
             for k in 0..3 {
                 let got = f64::from(rendered.color[i][k]);
-                assert!((got - color[k]).abs() < 4e-4, "{isa:?}, pixel {i}: {got} instead of {}", color[k]);
+                assert!((got - color[k]).abs() < 1e-4, "{isa:?}, pixel {i}: {got} instead of {}", color[k]);
             }
         }
     }

@@ -4,6 +4,7 @@ mod edges;
 mod forward;
 mod gradients;
 mod harmonics;
+mod hostile;
 mod training;
 
 use glam::{Quat, Vec3};
@@ -79,5 +80,5 @@ pub fn random_view(camera: Camera, seed: u64) -> TrainingView {
 
 /// The instruction sets of this machine.
 pub fn isas() -> Vec<Isa> {
-    [Isa::Avx512, Isa::Avx2, Isa::Portable].into_iter().filter(|isa| isa.is_available()).collect()
+    Isa::ALL.into_iter().filter(|isa| isa.is_available()).collect()
 }

@@ -12,13 +12,13 @@ mod header;
 #[cfg(test)]
 mod tests;
 
-use std::io::Write;
+use std::io::{self, Write};
 
 use glam::{Quat, Vec3};
 use thiserror::Error;
 
 use self::header::{HEADER_MAX, Property};
-use super::{WriteError, check_finite, degree_of_rest};
+use super::{check_finite, degree_of_rest};
 use crate::model::{Gaussian, Gaussians, SH_REST_MAX, sh_rest_coefficients};
 
 /// Properties that must be there when read.
@@ -97,9 +97,14 @@ pub enum PlyError {
 /// Writes a model with all bands that it has.
 ///
 /// # Errors
-/// Those of the writer; [`WriteError::NotFinite`].
-pub fn write(gaussians: &Gaussians, to: &mut impl Write) -> Result<(), WriteError> {
-    check_finite(gaussians)?;
+/// Those of the writer; [`io::ErrorKind::InvalidData`] around [`WriteError::NotFinite`](super::WriteError).
+pub fn write(gaussians: &Gaussians, to: &mut impl Write) -> io::Result<()> {
+    check_finite(gaussians).map_err(|error| io::Error::new(io::ErrorKind::InvalidData, error))?;
+    write_checked(gaussians, to)
+}
+
+/// Writes a model that is finite.
+pub(super) fn write_checked(gaussians: &Gaussians, to: &mut impl Write) -> io::Result<()> {
     let coefficients = sh_rest_coefficients(gaussians.sh_degree());
     let rest: Vec<String> = (0..3 * coefficients).map(|k| format!("{REST}{k}")).collect();
     let names = PROPERTIES[..3].iter().chain(&NORMALS).chain(&PROPERTIES[3..6]).copied();

@@ -98,6 +98,16 @@ fn properties_come_in_any_order_and_type_among_others() {
 }
 
 #[test]
+fn a_model_that_is_not_finite_is_not_written() {
+    let mut model = bare(3);
+    model.set(2, &Gaussian { opacity_logit: f32::NAN, ..model.get(2) });
+    let mut file = Vec::new();
+    let error = write(&model, &mut file).unwrap_err();
+    assert_eq!((error.kind(), file.len()), (io::ErrorKind::InvalidData, 0));
+    assert!(error.to_string().contains("Gaussian 2") && error.to_string().contains("opacity_logit"), "{error}");
+}
+
+#[test]
 fn every_truncation_is_refused() {
     let bytes = bytes(&model(4, 1, 1));
     for length in 0..bytes.len() {
