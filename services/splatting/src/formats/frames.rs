@@ -18,6 +18,11 @@ use glam::{DMat3, DQuat, DVec3, Quat, Vec3};
 use super::sh_rotation::ShRotation;
 use crate::model::{Gaussian, Gaussians, SH_REST_MAX};
 
+/// Takes world coordinates to Y up.
+pub const Y_UP_FROM_WORLD: DMat3 = DMat3::from_cols(DVec3::X, DVec3::NEG_Z, DVec3::Y);
+/// Takes coordinates with Y up to the world.
+pub const WORLD_FROM_Y_UP: DMat3 = DMat3::from_cols(DVec3::X, DVec3::Z, DVec3::NEG_Y);
+
 /// A rotation of a whole model.
 #[derive(Clone, Debug)]
 pub struct Turn {
@@ -34,12 +39,12 @@ impl Turn {
 
     /// From the world frame to Y up. Means that are turned and turned back are the same to the bit.
     pub fn world_to_y_up() -> Self {
-        Self::new(DMat3::from_cols(DVec3::X, DVec3::NEG_Z, DVec3::Y))
+        Self::new(Y_UP_FROM_WORLD)
     }
 
     /// From Y up to the world frame.
     pub fn y_up_to_world() -> Self {
-        Self::world_to_y_up().inverse()
+        Self::new(WORLD_FROM_Y_UP)
     }
 
     /// The way back.
@@ -110,6 +115,7 @@ mod tests {
         assert_eq!(turn.mean(Vec3::Z), Vec3::Y);
         assert_eq!(turn.mean(Vec3::Y), Vec3::NEG_Z);
         assert_eq!(turn.mean(Vec3::X), Vec3::X);
+        assert_eq!(WORLD_FROM_Y_UP * Y_UP_FROM_WORLD, DMat3::IDENTITY);
         let axis = turn.rotation(Quat::IDENTITY) * Vec3::Z;
         assert!((axis - Vec3::Y).length() < 1e-6, "the quaternion is that of the matrix: {axis}");
     }

@@ -8,12 +8,14 @@ use super::{
     BIN, CHUNK_HEADER, COLOR_SPACE, EXTENSION, GlbError, HEADER, JSON, KERNEL, MAGIC, OPACITY, POSITION, PROJECTION,
     ROTATION, SCALE, SH_PREFIX, VERSION, rest_attributes, sh_attribute,
 };
-use crate::formats::frames::Turn;
+use crate::formats::frames::{Turn, WORLD_FROM_Y_UP};
 use crate::formats::{FLAT_LOG_SCALE, degree_of_rest, logit};
 use crate::model::{Gaussian, Gaussians, SH_REST_MAX, sh_rest_coefficients};
 
 /// Extensions without which a file may not be read, and that are known here.
 const KNOWN: [&str; 2] = [EXTENSION, "KHR_mesh_quantization"];
+/// As many as a .glb of 4 GiB can hold: no file makes more of itself by placing a mesh again and again.
+const GAUSSIANS_MAX: u64 = 1 << 26;
 /// By how much the columns of a node's matrix may differ from evenly scaled orthogonal ones.
 const SHEAR_MAX: f64 = 1e-4;
 
@@ -37,6 +39,11 @@ pub fn read(bytes: &[u8]) -> Result<Gaussians, GlbError> {
         }
     }
     let degree = fields.iter().map(|field| field.degree).max().ok_or(GlbError::NoSplats)?;
+    let count = fields.iter().fold(0_u64, |sum, field| sum.saturating_add(field.means.count as u64));
+    if count > GAUSSIANS_MAX {
+        let expected = format!("{GAUSSIANS_MAX} at most: place each mesh once");
+        return Err(document_error("the number of Gaussians in the scene", count.to_string(), expected));
+    }
     let mut model = Gaussians::with_sh_degree(degree);
     for field in &fields {
         field.append(&mut model)?;
@@ -164,9 +171,9 @@ struct Field<'a> {
     opacities: Column<'a>,
     degree_0: Column<'a>,
     bands: Vec<Column<'a>>,
-    /// To the scene, but for the rotation: uniform scale, then (after the turn) a translation in the world frame.
+    /// To the world frame: a uniform scale, then a rotation, then a translation.
     scale: f64,
-    turn: Turn,
+    rotation: DMat3,
     translation: DVec3,
 }
 
@@ -197,7 +204,6 @@ impl<'a> Field<'a> {
         let degree = degree_of(&name, primitive)?;
         let bands = rest_attributes(degree).into_iter().map(|name| others(&name, Allowed::Harmonics));
         let (scale, rotation) = decompose(&name, transform)?;
-        let to_world = Turn::y_up_to_world();
         Ok(Self {
             degree,
             means,
@@ -207,14 +213,15 @@ impl<'a> Field<'a> {
             degree_0: others(&sh_attribute(0, 0), Allowed::Harmonics)?,
             bands: bands.collect::<Result<_, _>>()?,
             scale,
-            translation: to_world.matrix() * transform.w_axis.truncate(),
-            turn: Turn::new(to_world.matrix() * rotation),
+            rotation: WORLD_FROM_Y_UP * rotation,
+            translation: WORLD_FROM_Y_UP * transform.w_axis.truncate(),
             name,
         })
     }
 
     fn append(&self, model: &mut Gaussians) -> Result<(), GlbError> {
-        let Self { scale, turn, translation, .. } = self;
+        let Self { scale, translation, .. } = self;
+        let turn = Turn::new(self.rotation);
         for index in 0..self.means.count {
             let wrong = |attribute: &str, value: String, expected| GlbError::Value {
                 index,

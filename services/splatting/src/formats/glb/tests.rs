@@ -355,6 +355,16 @@ fn documents_that_lie_are_refused() {
 }
 
 #[test]
+fn a_mesh_placed_too_often_is_refused_before_memory_is_taken() {
+    let file = bytes(Format::Glb, &bare(2000));
+    let message = refusal(&file, |json| {
+        json["nodes"] = json!(vec![json!({"mesh": 0}); 40_000]);
+        json["scenes"][0]["nodes"] = json!((0..40_000).collect::<Vec<u32>>());
+    });
+    assert!(message.contains("is 80000000, expected 67108864 at most"), "{message}");
+}
+
+#[test]
 fn what_is_not_supported_is_named() {
     let file = bytes(Format::Glb, &bare(3));
     let extension = |json: &mut Value, field: &str, value: Value| {

@@ -106,6 +106,45 @@ fn the_bytes_are_those_of_the_definition() {
     assert_eq!(data[36..], [96, 128, 128, 192, 128, 128, 112, 255, 128]);
 }
 
+/// Two Gaussians written by the format's own library: version 2.1.0 (SPZ 3), and commit 1986118 (SPZ 2).
+const LIBRARY_3: &str = "1f8b0800000000000003f3730f0e60666060600262461e2021c1c0c0c2c0f0e03fc3be9f0c060c0c1c0c0d0f1b96454e \
+     3e639c9051b3c06142e6d2a966f782562db170f0088848c828a868e8983063c18a0d3b0e0000dbff406b4a000000";
+const LIBRARY_2: &str = "1f8b0800000000000003f3730f0e606260600061461e2021c1c0c0c2c0f0e03fc3be9f0c060c0c1c0c0d0f1b96454e3e \
+     639c9051b3c061c27e87fdbdb3b82c1c3c022212320a2a1a3a26cc58b062c38e03006546b0a848000000";
+
+#[test]
+fn files_of_the_formats_own_library_are_read() {
+    for (hex, within) in [(LIBRARY_3, 0.004), (LIBRARY_2, 0.02)] {
+        let digits: Vec<u32> = hex.chars().filter_map(|c| c.to_digit(16)).collect();
+        let file: Vec<u8> = digits.chunks_exact(2).map(|pair| (16 * pair[0] + pair[1]) as u8).collect();
+        let model = read(&file).unwrap();
+        assert_eq!((model.len(), model.sh_degree()), (2, 1));
+        // What the library was given, with y up: (x, y, z) is the world's (x, -z, y).
+        let to_world = Quat::from_rotation_x(std::f32::consts::FRAC_PI_2);
+        let given = [
+            ([1.5, 0.25, -2.0], [-4.0, -3.5, -2.25], [0.5, -0.5, 0.5, 0.5], 0.0, [0.0, 1.0, -1.0]),
+            ([-100.125, 3.0, 0.5], [0.0, -6.0, -1.0], [0.1, 0.2, -0.9, 0.3], 2.0, [0.5, 2.0, -2.0]),
+        ];
+        for (i, (mean, log_scales, rotation, opacity_logit, sh)) in given.into_iter().enumerate() {
+            let g = model.get(i);
+            assert!((g.mean - to_world * Vec3::from_array(mean)).length() < 1e-4, "{}", g.mean);
+            assert_eq!(g.log_scales, Vec3::from_array(log_scales));
+            let angle = angle_between(g.rotation, to_world * Quat::from_array(rotation));
+            assert!(angle < within, "{angle}");
+            assert!((g.opacity_logit - opacity_logit).abs() < 0.02);
+            assert!(g.sh.iter().zip::<[f32; 3]>(sh).all(|(a, b)| (a - b).abs() < 0.014), "{:?}", g.sh);
+            // Of -y, z, -x with y up: -y is the world's -z, z is -y, x is x.
+            let band = model.sh_rest(i);
+            for c in 0..3 {
+                let given = |k: usize| 0.0625 * (9 * i + 3 * k + c) as f32 - 0.5625;
+                for (k, expected) in [(0, given(1)), (1, -given(0)), (2, given(2))] {
+                    assert!((band[k][c] - expected).abs() < 4.6 / 128.0, "{k}: {} {expected}", band[k][c]);
+                }
+            }
+        }
+    }
+}
+
 #[test]
 fn version_2_is_read() {
     let model = bare(5);
