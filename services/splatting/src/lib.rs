@@ -13,6 +13,7 @@ mod camera;
 pub mod checkpoint;
 mod densify;
 mod engine;
+pub mod formats;
 mod frame;
 mod gradient;
 mod initial;
@@ -21,7 +22,6 @@ pub mod metrics;
 mod model;
 mod neighbours;
 mod optimiser;
-pub mod ply;
 mod projection;
 pub mod reference;
 mod schedule;
@@ -42,6 +42,7 @@ pub use densify::{
     DefaultSettings, Densifier, DensifierState, DensifyError, DensifyReport, McmcSettings, Relocation, Strategy,
 };
 pub use engine::{DEPTH_ALPHA_TINY, Engine, EngineError, Moments, MomentsView, Rendered, Work};
+pub use formats::ply;
 pub use initial::{ColoredPoint, InitialError, InitialGaussians, random_points};
 pub use model::{Gaussian, Gaussians, SH_C0, SH_DEGREE_MAX, SH_REST_MAX, sh_rest_coefficients};
 pub use optimiser::Optimiser;
