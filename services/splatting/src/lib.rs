@@ -9,6 +9,7 @@
 
 mod backward;
 mod blend;
+pub mod bytes;
 mod camera;
 pub mod checkpoint;
 mod engine;
@@ -18,9 +19,11 @@ mod loss;
 pub mod metrics;
 mod model;
 mod optimiser;
+pub mod order;
 pub mod ply;
 mod projection;
 pub mod reference;
+pub mod rgbd;
 mod settings;
 mod simd;
 mod sort;
