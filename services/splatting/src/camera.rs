@@ -6,6 +6,8 @@
 
 use glam::{Mat3, Quat, Vec2, Vec3};
 
+use crate::model::SH_DEGREE_MAX;
+
 /// Rigid transform between two frames, named by both ends at the place of use (`world_from_camera`).
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Pose {
@@ -142,6 +144,9 @@ pub struct RenderSettings {
     pub transmittance_min: f32,
     /// Gaussians whose mean is nearer than this are not drawn, metres.
     pub near_m: f32,
+    /// Highest degree of spherical harmonics that is evaluated, 0 to 3; a model of a lower degree bounds it. 3DGS begins
+    /// with 0 and adds a degree every 1,000 iterations.
+    pub sh_degree: u8,
 }
 
 impl Default for RenderSettings {
@@ -153,6 +158,7 @@ impl Default for RenderSettings {
             alpha_min: 1.0 / 255.0,
             transmittance_min: 1e-4,
             near_m: 0.05,
+            sh_degree: SH_DEGREE_MAX,
         }
     }
 }

@@ -9,6 +9,7 @@
 use crate::camera::{Camera, RenderSettings};
 use crate::model::{Gaussians, LANES, Lanes};
 use crate::projection::{View, project};
+use crate::sh;
 use crate::simd::{Isa, Kernel, Simd, dispatch};
 use crate::sort::{Item, sort_by_key};
 use crate::workers::{Shared, Workers};
@@ -153,6 +154,7 @@ impl Frame {
         self.chunks.resize(chunks, Chunk::default());
 
         let view = View::new(camera, settings);
+        let sh_rows = gaussians.active_sh_rows(settings.sh_degree);
         let valid = camera.is_valid();
         let rows = Shared::new(&mut self.rows);
         let visible = Shared::new(&mut self.visible);
@@ -170,7 +172,8 @@ impl Frame {
                 )
             };
             let count = if valid { gaussians.len() } else { 0 };
-            let result = dispatch(isa, ProjectChunk { view: &view, gaussians, first, count, rows, visible, items });
+            let kernel = ProjectChunk { view: &view, gaussians, sh_rows, first, count, rows, visible, items };
+            let result = dispatch(isa, kernel);
             // SAFETY: one task per chunk.
             unsafe { results.write(chunk, result) };
         });
@@ -272,6 +275,8 @@ impl Frame {
 struct ProjectChunk<'a> {
     view: &'a View,
     gaussians: &'a Gaussians,
+    /// Rows of the higher bands that are evaluated.
+    sh_rows: usize,
     /// First block.
     first: usize,
     /// Gaussians of the model.
@@ -298,7 +303,12 @@ impl Kernel for ProjectChunk<'_> {
         let mut chunk = Chunk { items: 0, slots: 0, key_min: u32::MAX, key_max: 0 };
         for (i, visible) in self.visible.iter_mut().enumerate() {
             let block = self.first + i;
-            let p = project(s, self.view, &self.gaussians.blocks()[block], block_lanes(block, self.count));
+            let parameters = &self.gaussians.blocks()[block];
+            let mut p = project(s, self.view, parameters, block_lanes(block, self.count));
+            if self.sh_rows != 0 && s.bits(p.visible) != 0 {
+                let rest = &self.gaussians.rest_rows(block)[..self.sh_rows];
+                sh::add_bands(s, self.view, parameters, rest, &mut p);
+            }
             let bits = s.bits(p.visible);
             *visible = bits;
             if bits == 0 {

@@ -3,8 +3,11 @@
 use crate::backward::MOMENTS;
 use crate::frame::Frame;
 use crate::frame::Row;
-use crate::model::{Block, LANES, ROW_LOG_SCALE, ROW_MEAN, ROW_OPACITY, ROW_ROTATION, ROW_SH, ROWS, SH_C0};
+use crate::model::{
+    Block, LANES, Lanes, ROW_LOG_SCALE, ROW_MEAN, ROW_OPACITY, ROW_ROTATION, ROW_SH, ROWS, SH_C0, SH_REST_MAX,
+};
 use crate::projection::{Projected, View, project};
+use crate::sh;
 use crate::simd::{Simd, build};
 
 /// A gradient beyond this in any parameter is a broken Gaussian: it is left as it is.
@@ -13,13 +16,17 @@ const GRADIENT_MAX: f32 = 1e15;
 /// Gradients of one block of 16 Gaussians.
 pub(crate) struct BlockGradient<S: Simd> {
     pub rows: [S::F; ROWS],
+    /// Where higher bands are evaluated: their basis functions. The gradient of a coefficient is its function times
+    /// that of the colour, which is the one of degree 0 divided by [`SH_C0`].
+    pub bands: Option<[S::F; SH_REST_MAX]>,
     /// Lanes that changed at least one pixel and whose gradient is finite.
     pub lanes: S::M,
     /// Standard deviations, metres.
     pub scales: [S::F; 3],
 }
 
-/// Sums a block's partials over tiles, in the order of the tiles, and takes them through the projection.
+/// Sums a block's partials over tiles, in the order of the tiles, and takes them through the projection. `rest` are the
+/// rows of higher bands that are evaluated.
 #[inline(always)]
 pub(crate) fn block_gradient<S: Simd>(
     s: S,
@@ -27,7 +34,7 @@ pub(crate) fn block_gradient<S: Simd>(
     frame: &Frame,
     (slots, touched): (&[Row], &[u8]),
     block_index: usize,
-    block: &Block,
+    (block, rest): (&Block, &[Lanes]),
 ) -> Option<BlockGradient<S>> {
     let visible = frame.visible[block_index];
     let zero = s.splat(0.0);
@@ -52,13 +59,18 @@ pub(crate) fn block_gradient<S: Simd>(
     s.transpose(&mut rows);
     let moments = build!(zero; MOMENTS; |i| rows[i]);
     let projected = project(s, view, block, drawn);
-    let rows = parameter_gradients(s, view, &projected, &moments);
+    let mut rows = parameter_gradients(s, view, &projected, &moments);
+    let mut bands = None;
+    if !rest.is_empty() {
+        let d_color = [moments[6], moments[7], moments[8]];
+        bands = Some(sh::bands_gradient(s, view, block, rest, &d_color, &mut rows[ROW_MEAN..]));
+    }
     let mut size = zero;
     for g in rows {
         size = s.add(size, s.abs(g));
     }
     let lanes = s.and(s.mask(drawn), s.gt(s.splat(GRADIENT_MAX), size));
-    Some(BlockGradient { rows, lanes, scales: projected.scales })
+    Some(BlockGradient { rows, bands, lanes, scales: projected.scales })
 }
 
 /// Chain rule from the ten moments to the fourteen parameters.

@@ -25,6 +25,7 @@ mod projection;
 pub mod reference;
 pub mod rgbd;
 mod settings;
+mod sh;
 mod simd;
 mod sort;
 mod ssim;
@@ -40,5 +41,5 @@ pub use model::{Gaussian, Gaussians, SH_C0, SH_DEGREE_MAX, SH_REST_MAX, sh_rest_
 pub use optimiser::Optimiser;
 pub use settings::{LossTerms, TrainingSettings};
 pub use simd::Isa;
-pub use training::ParameterGradient;
+pub use training::{Gradient, ParameterGradient};
 pub use view::{PixelClass, TrainingView, ViewError};

@@ -283,7 +283,7 @@ impl Gaussians {
 
     /// Whether every parameter of every Gaussian is finite.
     pub fn is_finite(&self) -> bool {
-        self.iter().all(|g| g.is_finite()) && self.rest.iter().all(|row| row.0.iter().all(|c| c.is_finite()))
+        self.iter().all(|g| g.is_finite()) && self.rest().iter().all(|row| row.0.iter().all(|c| c.is_finite()))
     }
 
     /// A model of degree `sh_degree` from blocks (and rows of the higher bands) for exactly as many Gaussians as there
@@ -301,10 +301,6 @@ impl Gaussians {
 
     pub(crate) fn blocks(&self) -> &[Block] {
         &self.blocks
-    }
-
-    pub(crate) fn blocks_mut(&mut self) -> &mut [Block] {
-        &mut self.blocks
     }
 
     /// Rows of the higher bands of one block.

@@ -1,11 +1,11 @@
 //! Adam with a state that lives as long as the mission (A32), one step count per Gaussian, drawn Gaussians only.
 
 use crate::model::{
-    Block, Gaussians, LANES, Lanes, ROW_LOG_SCALE, ROW_OPACITY, ROW_ROTATION, ROW_SH, ROWS, resize_rows, select_lanes,
-    select_row_lanes, sh_rest_rows,
+    Block, Gaussians, LANES, Lanes, ROW_LOG_SCALE, ROW_OPACITY, ROW_ROTATION, ROW_SH, ROWS, SH_C0, SH_REST_MAX,
+    resize_rows, select_lanes, select_row_lanes, sh_rest_rows,
 };
 use crate::settings::TrainingSettings;
-use crate::simd::Simd;
+use crate::simd::{Simd, build};
 
 /// Moments and step counts of every Gaussian, in the order of the model.
 ///
@@ -96,6 +96,7 @@ impl Optimiser {
 /// Constants of one step, the same for all Gaussians.
 pub(crate) struct AdamStep<'a> {
     learning_rates: [f32; ROWS],
+    learning_rate_rest: f32,
     betas: (f32, f32),
     epsilon: f32,
     log_scale_limits: (f32, f32),
@@ -112,6 +113,7 @@ impl<'a> AdamStep<'a> {
         let limit = |sigma: f32| sigma.max(1e-9).ln();
         Self {
             learning_rates,
+            learning_rate_rest: settings.lr_sh_rest,
             betas: settings.betas,
             epsilon: settings.epsilon,
             log_scale_limits: settings.sigma_limits_m.map_or((-20.0, 10.0), |(low, high)| (limit(low), limit(high))),
@@ -119,7 +121,7 @@ impl<'a> AdamStep<'a> {
         }
     }
 
-    /// One step for the given lanes of a block.
+    /// One step for the given lanes of a block; returns the corrections of its moments, for the higher bands.
     #[inline(always)]
     pub(crate) fn apply<S: Simd>(
         &self,
@@ -128,7 +130,7 @@ impl<'a> AdamStep<'a> {
         lanes: S::M,
         block: &mut Block,
         (first, second, steps): (&mut Block, &mut Block, &mut [u32]),
-    ) {
+    ) -> [S::F; 2] {
         let bits = s.bits(lanes);
         let (mut first_correction, mut second_correction) = ([1.0; LANES], [1.0; LANES]);
         for (lane, steps) in steps.iter_mut().enumerate() {
@@ -139,29 +141,62 @@ impl<'a> AdamStep<'a> {
                 }
             }
         }
-        let c1 = s.load(&first_correction);
-        let c2 = s.load(&second_correction);
-        let (beta1, beta2) = (s.splat(self.betas.0), s.splat(self.betas.1));
-        let epsilon = s.splat(self.epsilon);
+        let corrections = [s.load(&first_correction), s.load(&second_correction)];
         for row in 0..ROWS {
-            let g = gradient[row];
-            let old_m = s.load(&first.0[row].0);
-            let old_v = s.load(&second.0[row].0);
+            let moments = (&mut first.0[row], &mut second.0[row]);
+            let step = self.step(s, gradient[row], lanes, &corrections, moments);
             let old = s.load(&block.0[row].0);
-            // b m + (1 - b) g = g + b (m - g)
-            let m = s.fma(beta1, s.sub(old_m, g), g);
-            let g2 = s.mul(g, g);
-            let v = s.fma(beta2, s.sub(old_v, g2), g2);
-            let step = s.div(s.mul(m, c1), s.fma(s.sqrt(v), c2, epsilon));
             let mut new = s.fnma(s.splat(self.learning_rates[row]), step, old);
             if (ROW_LOG_SCALE..ROW_ROTATION).contains(&row) {
                 let (low, high) = self.log_scale_limits;
                 new = s.min(s.max(new, s.splat(low)), s.splat(high));
             }
-            s.store(s.select(lanes, m, old_m), &mut first.0[row].0);
-            s.store(s.select(lanes, v, old_v), &mut second.0[row].0);
             s.store(s.select(lanes, new, old), &mut block.0[row].0);
         }
+        corrections
+    }
+
+    /// The step of the higher bands that goes with [`AdamStep::apply`]; `gradient` is that of all other parameters,
+    /// `bands` are the basis functions. A band has no step count of its own: one that is evaluated later begins with
+    /// zero moments at its Gaussian's count, as in 3DGS.
+    #[inline(always)]
+    pub(crate) fn apply_rest<S: Simd>(
+        &self,
+        s: S,
+        (gradient, bands): (&[S::F; ROWS], &[S::F; SH_REST_MAX]),
+        (lanes, corrections): (S::M, &[S::F; 2]),
+        rest: &mut [Lanes],
+        (first, second): (&mut [Lanes], &mut [Lanes]),
+    ) {
+        let color = build!(gradient[0]; 3; |k| s.mul(gradient[ROW_SH + k], s.splat(1.0 / SH_C0)));
+        for (row, (rest, moments)) in rest.iter_mut().zip(first.iter_mut().zip(second)).enumerate() {
+            let step = self.step(s, s.mul(bands[row / 3], color[row % 3]), lanes, corrections, moments);
+            let old = s.load(&rest.0);
+            let new = s.fnma(s.splat(self.learning_rate_rest), step, old);
+            s.store(s.select(lanes, new, old), &mut rest.0);
+        }
+    }
+
+    /// Moves the moments of one row and gives the step before its learning rate.
+    #[inline(always)]
+    fn step<S: Simd>(
+        &self,
+        s: S,
+        g: S::F,
+        lanes: S::M,
+        corrections: &[S::F; 2],
+        (first, second): (&mut Lanes, &mut Lanes),
+    ) -> S::F {
+        let (beta1, beta2) = (s.splat(self.betas.0), s.splat(self.betas.1));
+        let old_m = s.load(&first.0);
+        let old_v = s.load(&second.0);
+        // b m + (1 - b) g = g + b (m - g)
+        let m = s.fma(beta1, s.sub(old_m, g), g);
+        let g2 = s.mul(g, g);
+        let v = s.fma(beta2, s.sub(old_v, g2), g2);
+        s.store(s.select(lanes, m, old_m), &mut first.0);
+        s.store(s.select(lanes, v, old_v), &mut second.0);
+        s.div(s.mul(m, corrections[0]), s.fma(s.sqrt(v), corrections[1], s.splat(self.epsilon)))
     }
 }
 

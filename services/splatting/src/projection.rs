@@ -17,7 +17,7 @@ pub(crate) const JACOBIAN_MARGIN: f32 = 1.3;
 /// Splats whose 2-D covariance has a determinant beyond this (px⁴) are broken parameters, not surfaces.
 const DETERMINANT_MAX: f32 = 1e20;
 /// Bound on positions (px), colours and depths that may enter a sum.
-const VALUE_MAX: f32 = 1e9;
+pub(crate) const VALUE_MAX: f32 = 1e9;
 
 /// What every lane needs from the camera and the settings.
 #[derive(Clone, Copy)]

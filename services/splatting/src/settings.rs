@@ -16,8 +16,10 @@ pub struct TrainingSettings {
     pub lr_rotations: f32,
     /// Adam learning rate of opacity logits.
     pub lr_opacity: f32,
-    /// Adam learning rate of SH coefficients.
+    /// Adam learning rate of SH coefficients of degree 0.
     pub lr_sh: f32,
+    /// Adam learning rate of SH coefficients above degree 0: a twentieth of that of degree 0, as in 3DGS.
+    pub lr_sh_rest: f32,
     /// Adam decay of the first and the second moment.
     pub betas: (f32, f32),
     /// Adam's guard against division by zero.
@@ -45,6 +47,7 @@ impl Default for TrainingSettings {
             lr_rotations: 1e-3,
             lr_opacity: 0.05,
             lr_sh: 3e-3,
+            lr_sh_rest: 3e-3 / 20.0,
             betas: (0.9, 0.999),
             epsilon: 1e-15,
             l1_weight: 0.8,

@@ -7,9 +7,9 @@ use std::time::Instant;
 use crate::backward::BackwardTile;
 use crate::engine::Engine;
 use crate::frame::{Frame, Row, TILE};
-use crate::gradient::block_gradient;
+use crate::gradient::{BlockGradient, block_gradient};
 use crate::loss;
-use crate::model::{Block, Gaussians, LANES, Lanes, ROW_LOG_SCALE, ROWS};
+use crate::model::{Block, Gaussians, LANES, Lanes, ROW_LOG_SCALE, ROW_SH, ROWS, SH_C0, SH_REST_MAX, sh_rest_rows};
 use crate::optimiser::{AdamStep, Optimiser};
 use crate::projection::View;
 use crate::settings::{LossTerms, TrainingSettings};
@@ -23,6 +23,16 @@ const CHUNK_BLOCKS: usize = 32;
 /// Gradients of the fourteen parameters of a Gaussian, in the order mean x y z, log scales, rotation x y z w, opacity
 /// logit, SH of red, green, blue.
 pub type ParameterGradient = [f32; ROWS];
+
+/// Gradient of a view's loss, Gaussian by Gaussian in the order of the model.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Gradient {
+    /// Of the fourteen parameters that every Gaussian has.
+    pub parameters: Vec<ParameterGradient>,
+    /// Of the spherical harmonics above degree 0, in the order of [`Gaussians::sh_rest`]; 0 for bands that are not
+    /// evaluated.
+    pub sh_rest: Vec<[[f32; 3]; SH_REST_MAX]>,
+}
 
 impl Engine {
     /// One step of Adam on one view. Only Gaussians that changed a pixel of the view move, each with its own step count.
@@ -40,20 +50,25 @@ impl Engine {
         self.corrections.update(settings.betas);
         let terms = self.accumulate(gaussians, view, settings);
         let accumulated = Instant::now();
-        let pass = ParameterPass::new(self, view, settings, gaussians.len());
+        let pass = ParameterPass::new(self, gaussians, view, settings);
         let adam = AdamStep::new(settings, &self.corrections);
         let chunks = gaussians.blocks().len().div_ceil(CHUNK_BLOCKS);
         let mut isotropic = vec![0.0; chunks];
         let results = Shared::new(&mut isotropic);
         let count = gaussians.blocks().len();
         let total = gaussians.len();
-        let blocks = Shared::new(gaussians.blocks_mut());
+        let rows = sh_rest_rows(gaussians.sh_degree());
+        let (blocks, rest) = gaussians.parts_mut();
+        let (blocks, rest) = (Shared::new(blocks), Shared::new(rest));
         let first = Shared::new(&mut optimiser.first);
         let second = Shared::new(&mut optimiser.second);
+        let first_rest = Shared::new(&mut optimiser.first_rest);
+        let second_rest = Shared::new(&mut optimiser.second_rest);
         let steps = Shared::new(&mut optimiser.steps);
         self.workers.run(chunks, |_, chunk| {
             let range = chunk * CHUNK_BLOCKS..count.min((chunk + 1) * CHUNK_BLOCKS);
             let lanes = range.start * LANES..total.min(range.end * LANES);
+            let bands = range.start * rows..range.end * rows;
             // SAFETY: the ranges of different chunks do not overlap.
             let kernel = unsafe {
                 AdamChunk {
@@ -64,6 +79,10 @@ impl Engine {
                     first: first.slice_mut(range.clone()),
                     second: second.slice_mut(range),
                     steps: steps.slice_mut(lanes),
+                    rest_rows: rows,
+                    rest: rest.slice_mut(bands.clone()),
+                    first_rest: first_rest.slice_mut(bands.clone()),
+                    second_rest: second_rest.slice_mut(bands),
                 }
             };
             // SAFETY: one task per chunk.
@@ -79,19 +98,29 @@ impl Engine {
         gaussians: &Gaussians,
         view: &TrainingView,
         settings: &TrainingSettings,
-    ) -> (LossTerms, Vec<ParameterGradient>) {
+    ) -> (LossTerms, Gradient) {
         let terms = self.accumulate(gaussians, view, settings);
-        let pass = ParameterPass::new(self, view, settings, gaussians.len());
+        let pass = ParameterPass::new(self, gaussians, view, settings);
         let mut isotropic = Vec::new();
-        let mut gradients = vec![[0.0; ROWS]; gaussians.len()];
+        let mut out = Gradient {
+            parameters: vec![[0.0; ROWS]; gaussians.len()],
+            sh_rest: vec![[[0.0; 3]; SH_REST_MAX]; gaussians.len()],
+        };
         for (index, block) in gaussians.blocks().iter().enumerate() {
-            let (gradient, sum) = dispatch(self.isa, GradientBlock { pass: &pass, index, block });
+            let rest = &gaussians.rest_rows(index)[..pass.sh_rows];
+            let (gradient, bands, sum) = dispatch(self.isa, GradientBlock { pass: &pass, index, block, rest });
             isotropic.push(sum);
-            for (lane, to) in gradients[index * LANES..].iter_mut().take(LANES).enumerate() {
+            let first = index * LANES;
+            for (lane, to) in out.parameters[first..].iter_mut().take(LANES).enumerate() {
                 *to = std::array::from_fn(|row| gradient.0[row].0[lane]);
             }
+            for (row, lanes) in bands.iter().enumerate().take(pass.sh_rows) {
+                for (to, value) in out.sh_rest[first..].iter_mut().zip(lanes.0) {
+                    to[row / 3][row % 3] = value;
+                }
+            }
         }
-        (finish(terms, &isotropic, gaussians.len(), settings), gradients)
+        (finish(terms, &isotropic, gaussians.len(), settings), out)
     }
 
     /// Renders the view, evaluates the loss, and leaves the moments of every (tile, Gaussian) in the slots.
@@ -169,24 +198,27 @@ struct ParameterPass<'a> {
     frame: &'a Frame,
     slots: &'a [Row],
     touched: &'a [u8],
+    /// Rows of the higher bands that are evaluated.
+    sh_rows: usize,
     /// Isotropic weight divided by the number of standard deviations of the model.
     isotropic: f32,
 }
 
 impl<'a> ParameterPass<'a> {
-    fn new(engine: &'a Engine, view: &TrainingView, settings: &TrainingSettings, count: usize) -> Self {
+    fn new(engine: &'a Engine, model: &Gaussians, view: &TrainingView, settings: &TrainingSettings) -> Self {
         Self {
             view: View::new(view.camera(), &settings.render),
             frame: &engine.frame,
             slots: &engine.slots,
             touched: &engine.touched,
-            isotropic: settings.isotropic_weight / (3 * count.max(1)) as f32,
+            sh_rows: model.active_sh_rows(settings.render.sh_degree),
+            isotropic: settings.isotropic_weight / (3 * model.len().max(1)) as f32,
         }
     }
 
     /// Gradient of one block with the regulariser, and the regulariser's sum |s - mean(s)|.
     #[inline(always)]
-    fn block<S: Simd>(&self, s: S, index: usize, block: &Block) -> Option<([S::F; ROWS], S::M, f64)> {
+    fn block<S: Simd>(&self, s: S, index: usize, block: (&Block, &[Lanes])) -> Option<(BlockGradient<S>, f64)> {
         let partials = (self.slots, self.touched);
         let mut gradient = block_gradient(s, &self.view, self.frame, partials, index, block)?;
         let mut sum = 0.0;
@@ -203,7 +235,7 @@ impl<'a> ParameterPass<'a> {
                 sum += loss::sum(s, s.keep(gradient.lanes, s.abs(difference[k])));
             }
         }
-        Some((gradient.rows, gradient.lanes, sum))
+        Some((gradient, sum))
     }
 }
 
@@ -215,6 +247,11 @@ struct AdamChunk<'a> {
     first: &'a mut [Block],
     second: &'a mut [Block],
     steps: &'a mut [u32],
+    /// Rows of the higher bands per block, in the three that follow.
+    rest_rows: usize,
+    rest: &'a mut [Lanes],
+    first_rest: &'a mut [Lanes],
+    second_rest: &'a mut [Lanes],
 }
 
 impl Kernel for AdamChunk<'_> {
@@ -225,9 +262,16 @@ impl Kernel for AdamChunk<'_> {
         let mut isotropic = 0.0;
         let state = self.first.iter_mut().zip(self.second).zip(self.steps.chunks_mut(LANES));
         for (i, (block, ((first, second), steps))) in self.blocks.iter_mut().zip(state).enumerate() {
-            if let Some((gradient, lanes, sum)) = self.pass.block(s, self.start + i, block) {
+            let bands = i * self.rest_rows..i * self.rest_rows + self.pass.sh_rows;
+            let rest = &mut self.rest[bands.clone()];
+            if let Some((gradient, sum)) = self.pass.block(s, self.start + i, (block, rest)) {
                 isotropic += sum;
-                self.adam.apply(s, &gradient, lanes, block, (first, second, steps));
+                let corrections = self.adam.apply(s, &gradient.rows, gradient.lanes, block, (first, second, steps));
+                if let Some(basis) = &gradient.bands {
+                    let moments = (&mut self.first_rest[bands.clone()], &mut self.second_rest[bands]);
+                    let lanes = (gradient.lanes, &corrections);
+                    self.adam.apply_rest(s, (&gradient.rows, basis), lanes, rest, moments);
+                }
             }
         }
         isotropic
@@ -238,18 +282,27 @@ struct GradientBlock<'a> {
     pass: &'a ParameterPass<'a>,
     index: usize,
     block: &'a Block,
+    rest: &'a [Lanes],
 }
 
 impl Kernel for GradientBlock<'_> {
-    type Output = (Block, f64);
+    type Output = (Block, [Lanes; 3 * SH_REST_MAX], f64);
 
     #[inline(always)]
-    fn run<S: Simd>(self, s: S) -> (Block, f64) {
-        let mut out = Block::ZERO;
-        let Some((rows, lanes, sum)) = self.pass.block(s, self.index, self.block) else { return (out, 0.0) };
-        for (to, row) in out.0.iter_mut().zip(rows) {
-            s.store(s.keep(lanes, row), &mut to.0);
+    fn run<S: Simd>(self, s: S) -> Self::Output {
+        let (mut out, mut bands) = (Block::ZERO, [Lanes([0.0; LANES]); 3 * SH_REST_MAX]);
+        let Some((gradient, sum)) = self.pass.block(s, self.index, (self.block, self.rest)) else {
+            return (out, bands, 0.0);
+        };
+        for (to, row) in out.0.iter_mut().zip(gradient.rows) {
+            s.store(s.keep(gradient.lanes, row), &mut to.0);
         }
-        (out, sum)
+        if let Some(basis) = &gradient.bands {
+            for (row, to) in bands.iter_mut().enumerate() {
+                let color = s.mul(gradient.rows[ROW_SH + row % 3], s.splat(1.0 / SH_C0));
+                s.store(s.keep(gradient.lanes, s.mul(basis[row / 3], color)), &mut to.0);
+            }
+        }
+        (out, bands, sum)
     }
 }

@@ -3,6 +3,7 @@
 mod edges;
 mod forward;
 mod gradients;
+mod harmonics;
 mod training;
 
 use glam::{Quat, Vec3};

@@ -109,7 +109,7 @@ fn the_first_step_has_the_length_of_the_learning_rate() {
     let view = random_view(camera(50, 40), 4);
     let settings = TrainingSettings::default();
     let mut engine = Engine::new(1).unwrap();
-    let (_, gradient) = engine.gradient(&model, &view, &settings);
+    let gradient = engine.gradient(&model, &view, &settings).1.parameters;
     engine.train_step(&mut model, &mut Optimiser::new(), &view, &settings);
     let mut checked = 0;
     for (i, gradient) in gradient.iter().enumerate().filter(|(_, g)| g[0].abs() > 1e-7 && g[10].abs() > 1e-7) {
