@@ -156,6 +156,8 @@ pub fn loss(parameters: &[Parameters], view: &TrainingView, settings: &TrainingS
             scales.iter().map(|s| (s - mean).abs()).sum::<f64>()
         })
         .sum();
+    let opacity: f64 = parameters.iter().map(|p| 1.0 / (1.0 + (-p[10]).exp())).sum();
+    let scale: f64 = parameters.iter().flat_map(|p| &p[3..6]).map(|s| s.exp()).sum();
     let similarity = crate::metrics::ssim_map(&rendered, &target, width, height)
         .map_or(1.0, |map| map.iter().sum::<f64>() / map.len() as f64);
     let per = |sum: f64, count: usize| sum / count.max(1) as f64;
@@ -164,4 +166,6 @@ pub fn loss(parameters: &[Parameters], view: &TrainingView, settings: &TrainingS
         + f64::from(settings.depth_weight) * per(depth, view.with_depth)
         + f64::from(settings.free_weight) * per(free, view.free)
         + f64::from(settings.isotropic_weight) * per(isotropic, 3 * parameters.len())
+        + f64::from(settings.opacity_weight) * per(opacity, parameters.len())
+        + f64::from(settings.scale_weight) * per(scale, 3 * parameters.len())
 }

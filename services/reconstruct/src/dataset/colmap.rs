@@ -155,8 +155,7 @@ fn entry_of(
         let found = format!("{:?}", image.rotation);
         return Err(DatasetError::damaged(images_file, field("QW QX QY QZ"), found, "a quaternion of length 1"));
     }
-    let world_from_camera =
-        Pose { rotation: camera_from_world.rotation.normalize(), ..camera_from_world }.inverse();
+    let world_from_camera = Pose { rotation: camera_from_world.rotation.normalize(), ..camera_from_world }.inverse();
     let Some(camera) = cameras.get(&image.camera) else {
         let expected = "the id of a camera of the model";
         return Err(DatasetError::damaged(images_file, field("CAMERA_ID"), image.camera.to_string(), expected));
@@ -213,9 +212,7 @@ fn check_point(position: DVec3) -> Result<DVec3, String> {
 
 /// A point, or the reason why it is none.
 fn point_of(path: &Path, id: u64, position: [f64; 3], rgb: [u8; 3]) -> Result<Point, DatasetError> {
-    let position = check_point(DVec3::from_array(position)).map_err(|found| {
-        DatasetError::damaged(path, format!("point {id}: X Y Z"), found, "finite numbers")
-    })?;
+    let position = check_point(DVec3::from_array(position))
+        .map_err(|found| DatasetError::damaged(path, format!("point {id}: X Y Z"), found, "finite numbers"))?;
     Ok(Point { position, rgb })
 }
-

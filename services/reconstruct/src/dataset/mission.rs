@@ -76,7 +76,8 @@ fn stage_of(path: &Path, config: &Config) -> Result<Stage, DatasetError> {
     let wrong = |field: &str, value: &Value| {
         DatasetError::damaged(path, format!("prior.{field}"), value.to_string(), "finite numbers").at_line(line)
     };
-    let number = |field: &str, value: &Value| value.as_f64().filter(|v| v.is_finite()).ok_or_else(|| wrong(field, value));
+    let number =
+        |field: &str, value: &Value| value.as_f64().filter(|v| v.is_finite()).ok_or_else(|| wrong(field, value));
     let mut center = DVec3::ZERO;
     for axis in 0..3 {
         center[axis] = number("center_m", &prior["center_m"][axis])?;

@@ -211,7 +211,9 @@ fn intrinsics_of(frame: &Frame<'_>, width: u32, height: u32) -> Result<Intrinsic
 /// The pose of a camera-to-world matrix with OpenGL's axes. It must be rigid: a scaled or mirrored one would bend the scene.
 fn pose_of(frame: &Frame<'_>) -> Result<Pose, DatasetError> {
     const KEY: &str = "transform_matrix";
-    let Some(value) = frame.frame.get(KEY) else { return Err(frame.wrong(KEY, "missing", "four rows of four numbers")) };
+    let Some(value) = frame.frame.get(KEY) else {
+        return Err(frame.wrong(KEY, "missing", "four rows of four numbers"));
+    };
     let rows: Vec<Vec<f64>> = serde_json::from_value(value.clone())
         .map_err(|_not_numbers| frame.wrong(KEY, value.to_string(), "four rows of four numbers"))?;
     if !(3..=4).contains(&rows.len()) || rows.iter().any(|row| row.len() != 4) {
@@ -235,4 +237,3 @@ fn pose_of(frame: &Frame<'_>) -> Result<Pose, DatasetError> {
     let optical = DMat3::from_cols(axes[0], -axes[1], -axes[2]);
     Ok(Pose { position_m: column(3), rotation: DQuat::from_mat3(&optical).normalize() })
 }
-

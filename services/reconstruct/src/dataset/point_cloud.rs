@@ -80,8 +80,9 @@ const WANTED: [&str; 6] = ["x", "y", "z", "red", "green", "blue"];
 /// # Errors
 /// [`DatasetError`] naming the file, the line and what is wrong.
 pub fn read(path: &Path) -> Result<Vec<Point>, DatasetError> {
-    let bytes = std::fs::read(path)
-        .map_err(|source| DatasetError::read(path, source, "the dataset names it; add it, or take ply_file_path out"))?;
+    let bytes = std::fs::read(path).map_err(|source| {
+        DatasetError::read(path, source, "the dataset names it; add it, or take ply_file_path out")
+    })?;
     let header = header(path, &bytes)?;
     let places = WANTED.map(|name| header.properties.iter().position(|(property, _)| property == name));
     if let Some(missing) = places[..3].iter().position(Option::is_none) {
@@ -97,8 +98,9 @@ pub fn read(path: &Path) -> Result<Vec<Point>, DatasetError> {
     let mut points = Vec::with_capacity(header.vertices);
     let mut values = vec![0.0; header.properties.len()];
     if header.text {
-        let text = std::str::from_utf8(body)
-            .map_err(|_error| DatasetError::damaged(path, "text", "not UTF-8", "format ascii 1.0 as the header says"))?;
+        let text = std::str::from_utf8(body).map_err(|_error| {
+            DatasetError::damaged(path, "text", "not UTF-8", "format ascii 1.0 as the header says")
+        })?;
         let mut lines = text.lines().enumerate();
         for _ in 0..header.vertices {
             let Some((index, line)) = lines.next() else {
@@ -230,7 +232,11 @@ mod tests {
     #[test]
     fn what_is_wrong_is_named_with_its_line() {
         let refused = |from: &str, to: &str| of(TEXT.replace(from, to).as_bytes()).expect_err(to);
-        assert!(refused("-1.5 0", "-1.5 zero").contains("line 15: a vertex is zero"), "{}", refused("-1.5 0", "-1.5 zero"));
+        assert!(
+            refused("-1.5 0", "-1.5 zero").contains("line 15: a vertex is zero"),
+            "{}",
+            refused("-1.5 0", "-1.5 zero")
+        );
         assert!(refused("vertex 2", "vertex 99999999999").contains("99999999999"));
         assert!(refused("vertex 2", "vertex 3").contains("cut off after 2 points"));
         assert!(refused("float y", "float why").contains("without y"));

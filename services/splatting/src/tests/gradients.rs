@@ -1,8 +1,10 @@
 //! Gradients of every parameter class against central differences of the reference.
 
+use glam::Vec3;
+
 use super::{camera, isas, random_view, scene};
 use crate::reference::{self, Parameters};
-use crate::{Engine, RenderSettings, TrainingSettings};
+use crate::{Engine, Gaussian, Optimiser, RenderSettings, TrainingSettings};
 
 const CLASSES: [(&str, std::ops::Range<usize>); 5] =
     [("means", 0..3), ("log scales", 3..6), ("rotations", 6..10), ("opacity", 10..11), ("SH", 11..14)];
@@ -82,6 +84,47 @@ fn of_the_whole_default_loss() {
 #[test]
 fn of_the_papers_loss_with_its_regulariser() {
     check(&TrainingSettings { isotropic_weight: 5.0, free_weight: 0.0, ..smooth() }, 24, 25);
+}
+
+#[test]
+fn of_the_whole_loss_with_the_regularisers_of_mcmc() {
+    check(&TrainingSettings { opacity_weight: 2.0, scale_weight: 3.0, ..smooth() }, 24, 27);
+}
+
+/// The regularisers reach every Gaussian, also one that the view does not show, and no broken one.
+#[test]
+fn of_the_regularisers_of_mcmc_alone() {
+    let settings = TrainingSettings { opacity_weight: 2.0, scale_weight: 3.0, ..only(9) };
+    let mut model = scene(37, 23);
+    model.set(20, &Gaussian { mean: Vec3::splat(50.0), ..model.get(20) });
+    let expected =
+        differences(&reference::parameters(&model), |p| reference::loss(p, &random_view(camera(35, 27), 5), &settings));
+    model.push(&Gaussian { opacity_logit: f32::NAN, ..model.get(0) });
+    model.push(&Gaussian { log_scales: Vec3::splat(500.0), ..model.get(0) });
+    let view = random_view(camera(35, 27), 5);
+    for isa in isas() {
+        let mut engine = Engine::with_isa(1, isa).unwrap();
+        let (terms, gradient) = engine.gradient(&model, &view, &settings);
+        let gradient = gradient.parameters;
+        for (i, (got, want)) in gradient.iter().zip(&expected).enumerate() {
+            for k in 0..14 {
+                // Two Gaussians more in the mean.
+                let want = want[k] * 37.0 / 39.0;
+                assert!(
+                    (f64::from(got[k]) - want).abs() <= 1e-5 * want.abs() + 1e-9,
+                    "{isa:?} {i} {k}: {got:?} {want}"
+                );
+            }
+        }
+        assert!(gradient[20][10] > 0.0 && gradient[20][3] > 0.0);
+        assert!(gradient[37..].iter().all(|g| *g == [0.0; 14]));
+        let opacity: f64 = model.iter().take(37).map(|g| f64::from(g.opacity())).sum();
+        assert!((terms.opacity - opacity / 39.0).abs() < 1e-6 && terms.scale_m > 0.0);
+        let (mut optimiser, mut moved) = (Optimiser::new(), model.clone());
+        engine.train_step(&mut moved, &mut optimiser, &view, &settings);
+        assert!((0..39).all(|i| optimiser.steps(i) == u32::from(i < 37)));
+        assert!(moved.get(20).opacity_logit < model.get(20).opacity_logit && moved.get(20).mean == model.get(20).mean);
+    }
 }
 
 #[test]

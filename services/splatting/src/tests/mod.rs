@@ -4,6 +4,7 @@ mod edges;
 mod forward;
 mod gradients;
 mod harmonics;
+mod statistics;
 mod training;
 
 use glam::{Quat, Vec3};

@@ -54,7 +54,12 @@ pub(super) fn cameras(path: &Path) -> Result<Lines<RawCamera>, DatasetError> {
     let mut cameras = Vec::new();
     for _ in 0..count(path, &mut reader, "the number of cameras", CAMERA_BYTES)? {
         let mut read = || -> Result<_, Truncated> {
-            Ok((reader.u32("a camera's id")?, reader.i32("a camera's model")?, reader.u64("a width")?, reader.u64("a height")?))
+            Ok((
+                reader.u32("a camera's id")?,
+                reader.i32("a camera's model")?,
+                reader.u64("a width")?,
+                reader.u64("a height")?,
+            ))
         };
         let (id, model, width, height) = read().map_err(cut(path))?;
         let Some((name, params)) = usize::try_from(model).ok().and_then(|model| MODELS.get(model)) else {

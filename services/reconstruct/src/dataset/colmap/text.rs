@@ -99,7 +99,11 @@ pub(super) fn images(path: &Path) -> Result<Lines<RawImage>, DatasetError> {
             && line.split_ascii_whitespace().count() % 3 != 0
         {
             let found = format!("{} words in line {number}", line.split_ascii_whitespace().count());
-            return Err(words.wrong("POINTS2D", &found, "three a point: every image has two lines, the second of points"));
+            return Err(words.wrong(
+                "POINTS2D",
+                &found,
+                "three a point: every image has two lines, the second of points",
+            ));
         }
     }
     Ok(images)
