@@ -196,6 +196,9 @@ pub enum ReconstructError {
     /// The renderer could not be started.
     #[error(transparent)]
     Engine(#[from] splatting::EngineError),
+    /// A setting of the densification is out of range.
+    #[error(transparent)]
+    Densify(#[from] splatting::DensifyError),
     /// An image and its camera are refused by the renderer.
     #[error("image {name}: {source}")]
     View {
@@ -242,7 +245,7 @@ impl ReconstructError {
             Self::Write(error) => folder_kind(error),
             Self::Output { .. } | Self::Engine(_) => ErrorKind::Missing,
             Self::View { .. } | Self::Empty { .. } => ErrorKind::Failed,
-            Self::Picture { .. } => ErrorKind::Internal,
+            Self::Picture { .. } | Self::Densify(_) => ErrorKind::Internal,
         }
     }
 }

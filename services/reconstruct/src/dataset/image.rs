@@ -5,6 +5,7 @@ use std::io::BufReader;
 use std::path::Path;
 
 use image::{DynamicImage, ImageDecoder as _, ImageReader, Limits};
+use splatting::bytes::checksum;
 use splatting::rgbd::clip_box::ClipBox;
 use splatting::rgbd::{downsample, masks};
 use splatting::{Camera, PixelClass, TrainingView, ViewError};
@@ -90,6 +91,19 @@ impl Image {
         };
         let depth = self.depth_m.as_ref().map_or(0, |depth| size_of_val(&depth[..]));
         (colors + depth + self.classes.as_ref().map_or(0, Vec::len)) as u64
+    }
+
+    /// Checksum of everything in it.
+    pub(crate) fn fingerprint(&self) -> u64 {
+        let mut bytes = Vec::with_capacity(self.colors.len() * 8);
+        match &self.colors {
+            Colors::Bytes(pixels) => bytes.extend(pixels.iter().flatten()),
+            Colors::Words(pixels) => bytes.extend(pixels.iter().flatten().flat_map(|value| value.to_le_bytes())),
+        }
+        bytes.extend(self.depth_m.iter().flatten().flat_map(|depth| depth.to_le_bytes()));
+        bytes.extend(self.classes.iter().flatten().map(|class| *class as u8));
+        bytes.extend(format!("{:?} {:?} {:?}", self.name, self.camera, self.held_out).bytes());
+        checksum(&bytes)
     }
 
     /// The image as the loss wants it.

@@ -93,6 +93,7 @@ fn stage_of(path: &Path, config: &Config) -> Result<Stage, DatasetError> {
     Ok(Stage {
         clip: ClipBox::new(center, box_size_m, ground_z_m, config.trainer.ground_margin_m),
         box_size_m,
+        trainer: config.trainer.clone(),
         radius_m: match config.planner.radius {
             RadiusRule::Paper => box_size_m + 0.5,
             RadiusRule::Clear => (box_size_m + 0.5).max(0.87 * box_size_m + config.planner.clearance_m),

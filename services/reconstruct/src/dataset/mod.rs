@@ -15,8 +15,10 @@ use std::path::{Path, PathBuf};
 
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
+use shared_types::config::TrainerConfig;
 use shared_types::frames::{Intrinsics, Pose};
 use splatting::Camera;
+use splatting::bytes::checksum;
 use splatting::rgbd::clip_box::ClipBox;
 
 use crate::error::DatasetError;
@@ -88,7 +90,7 @@ pub struct Entry {
 }
 
 /// What is known of the part of the world that the model may fill, of a mission.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct Stage {
     /// The clip box.
     pub clip: ClipBox,
@@ -96,6 +98,8 @@ pub struct Stage {
     pub box_size_m: f64,
     /// Radius of the candidate sphere (R), metres.
     pub radius_m: f64,
+    /// How it was trained on in flight.
+    pub trainer: TrainerConfig,
 }
 
 /// A dataset as listed: everything but pixels.
@@ -139,6 +143,21 @@ impl Dataset {
     #[must_use]
     pub fn bytes(&self) -> u64 {
         self.images.iter().map(Image::bytes).sum()
+    }
+
+    /// Checksum of everything that training reads: names, cameras, pixels, depth, classes, points.
+    #[must_use]
+    pub fn fingerprint(&self) -> u64 {
+        let images: Vec<u64> = self.images.par_iter().map(Image::fingerprint).collect();
+        let mut bytes: Vec<u8> = images.iter().flat_map(|sum| sum.to_le_bytes()).collect();
+        for point in &self.points {
+            bytes.extend(point.position.to_array().iter().flat_map(|value| value.to_le_bytes()));
+            bytes.extend(point.rgb);
+        }
+        if let Some(stage) = &self.stage {
+            bytes.extend(format!("{stage:?}").bytes());
+        }
+        checksum(&bytes)
     }
 
     /// Whether any image has depth.
@@ -195,7 +214,7 @@ pub struct LoadOptions {
 pub fn load(listing: &Listing, options: &LoadOptions) -> Result<Dataset, DatasetError> {
     let downscale = options.downscale.unwrap_or(listing.downscale).max(1);
     check_memory(listing, downscale, options.memory_bytes)?;
-    let clip = listing.stage.map(|stage| stage.clip);
+    let clip = listing.stage.as_ref().map(|stage| stage.clip);
     // Decoders hold a whole image each: a bounded number at a time is what the pool's threads give.
     let images = listing
         .entries
@@ -207,7 +226,7 @@ pub fn load(listing: &Listing, options: &LoadOptions) -> Result<Dataset, Dataset
         images,
         points: listing.points.clone(),
         up: listing.up,
-        stage: listing.stage,
+        stage: listing.stage.clone(),
         downscale,
     })
 }
