@@ -267,6 +267,9 @@ pub struct Reconstruct {
     /// Megabytes that images may take; default: half of what is free.
     #[arg(long, value_name = "MB")]
     pub memory: Option<u64>,
+    /// Longest time between two checkpoints, milliseconds.
+    #[arg(long, default_value_t = 10_000, value_name = "MS", hide = true)]
+    pub checkpoint_ms: u64,
     /// Show no progress.
     #[arg(long, short)]
     pub quiet: bool,

@@ -92,6 +92,7 @@ fn options_of(arguments: &cli::Reconstruct) -> Options {
         hold_out: arguments.hold_out,
         memory_bytes: arguments.memory.map(|megabytes| megabytes.saturating_mul(1_000_000)),
         overwrite: arguments.overwrite,
+        checkpoint_period: Duration::from_millis(arguments.checkpoint_ms),
         ..defaults
     }
 }
@@ -216,22 +217,4 @@ impl Screen {
 }
 
 #[cfg(test)]
-mod tests {
-    use clap::Parser as _;
-
-    use super::*;
-
-    #[test]
-    fn the_command_s_defaults_are_the_library_s() {
-        let cli = cli::Cli::try_parse_from(["vantage", "reconstruct", "scene"]).expect("parses");
-        let cli::Command::Reconstruct(arguments) = cli.command else { panic!("another command") };
-        assert_eq!(format!("{:?}", options_of(&arguments)), format!("{:?}", Options::new("scene")));
-    }
-
-    #[test]
-    fn errors_carry_the_exit_code_of_their_kind() {
-        let unknown = reconstruct::run(&Options::new("/nonexistent"), &mut |_: &Event| ControlFlow::Continue(()));
-        let error = refusal(unknown.expect_err("no dataset"));
-        assert_eq!(crate::exit::exit_of(&error), Exit::Usage, "{error}");
-    }
-}
+mod tests;

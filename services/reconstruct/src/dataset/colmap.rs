@@ -216,3 +216,6 @@ fn point_of(path: &Path, id: u64, position: [f64; 3], rgb: [u8; 3]) -> Result<Po
         .map_err(|found| DatasetError::damaged(path, format!("point {id}: X Y Z"), found, "finite numbers"))?;
     Ok(Point { position, rgb })
 }
+
+#[cfg(test)]
+mod tests;

@@ -125,6 +125,15 @@ fn list_frames(
         }
         let (width, height) = dimensions(&file, "the dataset names it; add it, or take its frame out")?;
         let depth = frame.file(root, "depth_file_path")?;
+        let mask = frame.file(root, "mask_path")?;
+        for (key, beside) in [("depth_file_path", &depth), ("mask_path", &mask)] {
+            let Some(beside) = beside else { continue };
+            let found = dimensions(beside, &format!("its frame names it as {key}; add it, or take the key out"))?;
+            if found != (width, height) {
+                let expected = format!("{width} x {height} as its image has");
+                return Err(DatasetError::damaged(beside, "size", format!("{} x {}", found.0, found.1), expected));
+            }
+        }
         let unit_m = depth_unit(&frame)?;
         entries.push(Entry {
             name: name_of(root, &file),
@@ -132,7 +141,7 @@ fn list_frames(
             intrinsics: intrinsics_of(&frame, width, height)?,
             path: file,
             depth: depth.map(|path| DepthFile { path, unit_m }),
-            mask: frame.file(root, "mask_path")?,
+            mask,
             held_out,
         });
     }
@@ -237,3 +246,6 @@ fn pose_of(frame: &Frame<'_>) -> Result<Pose, DatasetError> {
     let optical = DMat3::from_cols(axes[0], -axes[1], -axes[2]);
     Ok(Pose { position_m: column(3), rotation: DQuat::from_mat3(&optical).normalize() })
 }
+
+#[cfg(test)]
+mod tests;

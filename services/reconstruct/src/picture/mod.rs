@@ -42,11 +42,13 @@ fn curve(points: &[(f64, f64)]) -> Canvas {
     const BOTTOM: f64 = 480.0;
     let mut canvas = Canvas::new(SIZE.0, SIZE.1, WHITE);
     let x_step = step(points.iter().map(|p| p.0).fold(0.0, f64::max));
-    let x_end = ticks_until(points.iter().map(|p| p.0).fold(0.0, f64::max), x_step);
+    let x_most = points.iter().map(|p| p.0).fold(0.0, f64::max);
+    let x_end = ((x_most / x_step).ceil() * x_step).max(x_step);
     let (low, high) =
         points.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), p| (low.min(p.1), high.max(p.1)));
     let y_step = step((high - low).max(1.0));
-    let (y_begin, y_end) = ((low / y_step).floor() * y_step, ticks_until(high, y_step));
+    let y_begin = (low / y_step).floor() * y_step;
+    let y_end = ((high / y_step).ceil() * y_step).max(y_begin + y_step);
     let x_of = |x: f64| LEFT + x / x_end * (RIGHT - LEFT);
     let y_of = |y: f64| BOTTOM - (y - y_begin) / (y_end - y_begin) * (BOTTOM - TOP);
     let label = |value: f64, step: f64| format!("{value:.*}", usize::from(step < 1.0));
@@ -81,10 +83,6 @@ fn step(range: f64) -> f64 {
     let least = (range / 10.0).max(1e-6);
     let power = 10f64.powf(least.log10().floor());
     [1.0, 2.0, 5.0, 10.0].into_iter().map(|factor| factor * power).find(|step| *step >= least).unwrap_or(least)
-}
-
-fn ticks_until(value: f64, step: f64) -> f64 {
-    ((value / step).ceil() * step).max(step)
 }
 
 /// Writes renders of the model beside the held-out images: the model left, the image right, one row each.
