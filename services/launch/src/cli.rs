@@ -35,8 +35,8 @@ pub enum Command {
     /// Measure a mission's model against held-out views and the true surface.
     #[command(after_help = "Example: vantage evaluate missions/20260801-120000-0 --json")]
     Evaluate(Evaluate),
-    /// Write a mission's model or views for other people's tools.
-    #[command(after_help = "Example: vantage export missions/20260801-120000-0 --format colmap --output colmap")]
+    /// Write a mission's model or views for other people's tools, or a model file in another format.
+    #[command(after_help = "Example: vantage export missions/20260801-120000-0 --format glb --output statue.glb")]
     Export(Export),
     /// Train a model offline on a mission folder, a COLMAP or a nerfstudio dataset.
     #[command(after_help = "Example: vantage reconstruct missions/20260801-120000-0 --iterations 30000\n\
@@ -185,8 +185,8 @@ pub struct Evaluate {
     /// Width of the held-out views, pixels; default: model.width. Another than the default is only printed.
     #[arg(long, value_name = "PIXELS")]
     pub width: Option<u32>,
-    /// Model to measure instead of the mission's own (INRIA PLY).
-    #[arg(long, value_name = "PLY")]
+    /// Model to measure instead of the mission's own (.ply, .splat, .spz or .glb).
+    #[arg(long, value_name = "FILE")]
     pub model: Option<PathBuf>,
     /// Print metrics.json instead of a table.
     #[arg(long)]
@@ -196,12 +196,13 @@ pub struct Evaluate {
 /// Arguments of `export`.
 #[derive(Debug, Clone, Args)]
 pub struct Export {
-    /// The mission folder.
-    pub folder: PathBuf,
+    /// The mission folder; or a model file (.ply, .splat, .spz or .glb) to write in another format.
+    #[arg(value_name = "DIR|FILE")]
+    pub source: PathBuf,
     /// What to write.
     #[arg(long, value_enum)]
     pub format: Format,
-    /// Where to; default: <folder>/export/<format>.
+    /// Where to; default: in DIR/export, or beside FILE.
     #[arg(long, value_name = "PATH")]
     pub output: Option<PathBuf>,
 }
@@ -209,8 +210,14 @@ pub struct Export {
 /// Formats of other people's tools.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub enum Format {
-    /// The model as an INRIA PLY, which every splat viewer reads.
+    /// The model as an INRIA PLY, which every splat viewer reads and which keeps everything.
     Ply,
+    /// The model as antimatter15's .splat, for web viewers; no view-dependent colours.
+    Splat,
+    /// The model as SPZ version 3, about six times smaller than PLY.
+    Spz,
+    /// The model as binary glTF with KHR_gaussian_splatting.
+    Glb,
     /// The views as a COLMAP text model.
     Colmap,
     /// The views as a nerfstudio transforms.json.

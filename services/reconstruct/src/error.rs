@@ -185,6 +185,14 @@ pub enum ReconstructError {
         /// The system's reason.
         source: std::io::Error,
     },
+    /// The model cannot be encoded.
+    #[error("{path}: cannot be encoded: {source}")]
+    Model {
+        /// The file.
+        path: PathBuf,
+        /// The encoder's reason.
+        source: splatting::formats::WriteError,
+    },
     /// A picture cannot be encoded.
     #[error("{path}: cannot be encoded: {source}")]
     Picture {
@@ -245,7 +253,7 @@ impl ReconstructError {
             Self::Write(error) => folder_kind(error),
             Self::Output { .. } | Self::Engine(_) => ErrorKind::Missing,
             Self::View { .. } | Self::Empty { .. } => ErrorKind::Failed,
-            Self::Picture { .. } | Self::Densify(_) => ErrorKind::Internal,
+            Self::Picture { .. } | Self::Model { .. } | Self::Densify(_) => ErrorKind::Internal,
         }
     }
 }

@@ -305,7 +305,7 @@ impl<'a> Run<'a> {
         let mut ply = Vec::new();
         let path = self.output.path("model.ply");
         splatting::ply::write(&self.state.model, &mut ply)
-            .map_err(|source| ReconstructError::Output { path: path.clone(), source })?;
+            .map_err(|source| ReconstructError::Model { path: path.clone(), source })?;
         shared_types::folder::write_atomic(&path, &ply)?;
         drop(ply);
         let threads = self.options.thread_count();

@@ -14,6 +14,7 @@ mod camera;
 pub mod checkpoint;
 mod densify;
 mod engine;
+pub mod formats;
 mod frame;
 mod gradient;
 mod initial;
@@ -23,7 +24,6 @@ mod model;
 mod neighbours;
 mod optimiser;
 pub mod order;
-pub mod ply;
 mod projection;
 pub mod reference;
 pub mod rgbd;
@@ -45,6 +45,7 @@ pub use densify::{
     DefaultSettings, Densifier, DensifierState, DensifyError, DensifyReport, McmcSettings, Relocation, Strategy,
 };
 pub use engine::{DEPTH_ALPHA_TINY, Engine, EngineError, Moments, MomentsView, Rendered};
+pub use formats::ply;
 pub use initial::{ColoredPoint, InitialError, InitialGaussians, random_points};
 pub use model::{Gaussian, Gaussians, SH_C0, SH_DEGREE_MAX, SH_REST_MAX, sh_rest_coefficients};
 pub use optimiser::Optimiser;
