@@ -4,6 +4,7 @@
 //! - [`service`]: one process of a mission in the foreground;
 //! - [`fly`], [`supervise`], [`progress`], [`summary`]: a whole mission;
 //! - [`evaluate`], [`export`]: what a mission folder is worth, and how it leaves Vantage;
+//! - [`reconstruct`]: offline training on a mission folder or another dataset;
 //! - [`status`], [`doctor`]: what runs, and whether this machine is fit for it.
 
 #![forbid(unsafe_code)]
@@ -19,6 +20,7 @@ pub mod instance;
 pub mod machine_check;
 pub mod proc;
 pub mod progress;
+pub mod reconstruct;
 pub mod service;
 pub mod settings;
 pub mod status;
@@ -70,6 +72,7 @@ fn run(command: &Command) -> anyhow::Result<Exit> {
         Command::Doctor(arguments) => doctor::run(arguments),
         Command::Evaluate(arguments) => evaluate::run(arguments),
         Command::Export(arguments) => export_any(arguments),
+        Command::Reconstruct(arguments) => reconstruct::run(arguments),
         Command::Config(arguments) => {
             print(&shared_types::config::commented(&settings::resolve(&arguments.settings)?)?)
         }

@@ -9,6 +9,7 @@
 
 mod backward;
 mod blend;
+pub mod bytes;
 mod camera;
 pub mod checkpoint;
 mod densify;
@@ -22,8 +23,10 @@ pub mod metrics;
 mod model;
 mod neighbours;
 mod optimiser;
+pub mod order;
 mod projection;
 pub mod reference;
+pub mod rgbd;
 mod schedule;
 mod settings;
 mod sh;
