@@ -32,6 +32,8 @@ const AHEAD: usize = 8;
 pub(crate) struct Scratch {
     /// Rows of the tile's list, and one that changes nothing.
     pub rows: Vec<Row>,
+    /// Result: moments by position in the tile's list as far as it was used, and of the row that changes nothing.
+    pub sums: Vec<Row>,
 }
 
 pub(crate) struct BackwardTile<'a> {
@@ -45,9 +47,6 @@ pub(crate) struct BackwardTile<'a> {
     pub gradients: &'a TilePixels,
     pub alpha_min: f32,
     pub scratch: &'a mut Scratch,
-    /// Result: moments by position in the tile's list as far as it was used. One longer than the list, for the row that
-    /// changes nothing.
-    pub sums: &'a mut [Row],
 }
 
 /// What a block's pixels need.
@@ -74,9 +73,11 @@ impl Kernel for BackwardTile<'_> {
         let used = self.contributors.used;
         let scratch = self.scratch;
         let nothing = s.splat(0.0);
-        scratch.rows.resize((used + 1).max(scratch.rows.len()), Lanes([0.0; 16]));
+        let length = (used + 1).max(scratch.rows.len());
+        scratch.rows.resize(length, Lanes([0.0; 16]));
+        scratch.sums.resize(length, Lanes([0.0; 16]));
         let rows = &mut scratch.rows[..=used];
-        let sums = &mut self.sums[..=used];
+        let sums = &mut scratch.sums[..=used];
         for (i, (&gaussian, (row, sum))) in self.entries.iter().zip(rows.iter_mut().zip(sums.iter_mut())).enumerate() {
             prefetch(self.entries.get(i + PREFETCH).map(|&g| &self.rows[g as usize]));
             s.store(s.load(&self.rows[gaussian as usize].0), &mut row.0);

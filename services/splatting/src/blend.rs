@@ -66,20 +66,20 @@ pub(crate) struct BlendTile<'a> {
     pub contributors: Option<&'a mut Contributors>,
 }
 
-/// Asks for the cache line of a row before it is needed.
+/// Asks for the cache line of a value before it is needed.
 #[inline(always)]
-pub(crate) fn prefetch(row: Option<&Row>) {
+pub(crate) fn prefetch<T>(value: Option<&T>) {
     #[cfg(target_arch = "x86_64")]
-    if let Some(row) = row {
+    if let Some(value) = value {
         #[expect(unsafe_code, reason = "a prefetch has no other form")]
         // SAFETY: a hint for an address inside a live reference; SSE is part of every x86-64.
         unsafe {
             use std::arch::x86_64::{_MM_HINT_T0, _mm_prefetch};
-            _mm_prefetch::<_MM_HINT_T0>(std::ptr::from_ref(row).cast());
+            _mm_prefetch::<_MM_HINT_T0>(std::ptr::from_ref(value).cast());
         }
     }
     #[cfg(not(target_arch = "x86_64"))]
-    let _no_prefetch = row;
+    let _no_prefetch = value;
 }
 
 /// Pixel-centre coordinates of a 4x4 block, and where it begins in a plane.

@@ -12,7 +12,7 @@ use crate::blend::{self, BlendTile, Channels, Contributors};
 use crate::camera::{Camera, RenderSettings};
 use crate::frame::{Frame, LAST, TILE};
 use crate::loss::LossImages;
-use crate::model::{Gaussians, Lanes};
+use crate::model::Gaussians;
 use crate::optimiser::Corrections;
 use crate::simd::{Isa, dispatch};
 use crate::ssim;
@@ -112,8 +112,8 @@ pub struct Engine {
     pub(crate) ssim_scratch: PerWorker<ssim::Scratch>,
     pub(crate) contributors: Vec<Contributors>,
     pub(crate) loss: LossImages,
-    /// Gradient moments of every (tile, splat), tile after tile in the order of its list.
-    pub(crate) sums: Vec<Lanes>,
+    /// Gradient moments of every (tile, splat), tile after tile, [`backward::MOMENTS`] each.
+    pub(crate) sums: Vec<f32>,
     /// Where in `sums` each slot's moments are.
     pub(crate) places: Vec<u32>,
     pub(crate) corrections: Corrections,

@@ -38,7 +38,7 @@ pub(crate) const THRESHOLD: usize = 10;
 /// B/A and B/C, for the nearest point of a block.
 pub(crate) const B_BY_A: usize = 11;
 pub(crate) const B_BY_C: usize = 12;
-/// Bits of u32: first gradient slot inside its chunk; tile corner x | y << 16; tile extent w | h << 16.
+/// Bits of u32: first gradient slot, counted from its chunk's; tile corner x | y << 16; tile extent w | h << 16.
 const SLOT: usize = 13;
 const CORNER: usize = 14;
 const EXTENT: usize = 15;
@@ -71,7 +71,6 @@ pub(crate) struct Footprint {
     pub tile_x: usize,
     pub tile_y: usize,
     pub width: usize,
-    pub height: usize,
 }
 
 impl Footprint {
@@ -107,6 +106,8 @@ pub(crate) struct Frame {
     /// Gradient slots of this view.
     pub slots: usize,
     slot_bases: Vec<usize>,
+    /// For each chunk, the first slot of each of its Gaussians and behind it all, counted from the chunk's first.
+    first_slots: Vec<u32>,
     chunks: Vec<Chunk>,
     items: Vec<Item>,
     sorted: Vec<Item>,
@@ -153,6 +154,7 @@ impl Frame {
         self.chunks.clear();
         self.chunks.resize(chunks, Chunk::default());
 
+        self.first_slots.resize(chunks * (CHUNK + 1), 0);
         let view = View::new(camera, settings);
         let sh_rows = gaussians.active_sh_rows(settings.sh_degree);
         let valid = camera.is_valid();
@@ -160,19 +162,22 @@ impl Frame {
         let visible = Shared::new(&mut self.visible);
         let items = Shared::new(&mut self.items);
         let results = Shared::new(&mut self.chunks);
+        let first_slots = Shared::new(&mut self.first_slots);
         workers.run(chunks, |_, chunk| {
             let first = chunk * CHUNK_BLOCKS;
             let last = blocks.min(first + CHUNK_BLOCKS);
             // SAFETY: the ranges of different chunks do not overlap.
-            let (rows, visible, items) = unsafe {
+            let (rows, visible, items, first_slots) = unsafe {
                 (
                     rows.slice_mut(first * LANES..last * LANES),
                     visible.slice_mut(first..last),
                     items.slice_mut(first * LANES..last * LANES),
+                    first_slots.slice_mut(chunk * (CHUNK + 1)..(chunk + 1) * (CHUNK + 1)),
                 )
             };
             let count = if valid { gaussians.len() } else { 0 };
-            let kernel = ProjectChunk { view: &view, gaussians, sh_rows, first, count, rows, visible, items };
+            let kernel =
+                ProjectChunk { view: &view, gaussians, sh_rows, first, count, rows, visible, items, first_slots };
             let result = dispatch(isa, kernel);
             // SAFETY: one task per chunk.
             unsafe { results.write(chunk, result) };
@@ -298,13 +303,16 @@ impl Frame {
         &self.entries[self.starts[tile] as usize..self.starts[tile + 1] as usize]
     }
 
-    /// Footprint of a visible Gaussian.
+    /// First slots of the 16 Gaussians of a block and behind them, and what to add to them.
     #[inline(always)]
-    pub(crate) fn footprint(&self, gaussian: usize) -> Footprint {
-        self.footprint_of(gaussian, &self.rows[gaussian])
+    pub(crate) fn block_slots(&self, block: usize) -> (&[u32; LANES + 1], usize) {
+        let chunk = block / CHUNK_BLOCKS;
+        let at = chunk * (CHUNK + 1) + block % CHUNK_BLOCKS * LANES;
+        // In range, as every chunk has CHUNK + 1 of them.
+        (self.first_slots[at..].first_chunk().unwrap_or(&[0; LANES + 1]), self.slot_bases[chunk])
     }
 
-    /// Footprint of a visible Gaussian whose row is at hand.
+    /// Footprint of a visible Gaussian, from its row.
     #[inline(always)]
     pub(crate) fn footprint_of(&self, gaussian: usize, row: &Row) -> Footprint {
         let row = &row.0;
@@ -314,7 +322,6 @@ impl Frame {
             tile_x: (corner & 0xffff) as usize,
             tile_y: (corner >> 16) as usize,
             width: (extent & 0xffff) as usize,
-            height: (extent >> 16) as usize,
         }
     }
 }
@@ -331,6 +338,7 @@ struct ProjectChunk<'a> {
     rows: &'a mut [Row],
     visible: &'a mut [u16],
     items: &'a mut [Item],
+    first_slots: &'a mut [u32],
 }
 
 /// Lanes of a block that hold Gaussians, of `count` in the model.
@@ -359,6 +367,7 @@ impl Kernel for ProjectChunk<'_> {
             let bits = s.bits(p.visible);
             *visible = bits;
             if bits == 0 {
+                self.first_slots[i * LANES..=(i + 1) * LANES].fill(chunk.slots as u32);
                 continue;
             }
             let scale = s.splat(0.5 * std::f32::consts::LOG2_E);
@@ -393,14 +402,20 @@ impl Kernel for ProjectChunk<'_> {
             s.store(s.pack_u16(x0, y0), &mut first);
             s.store(s.pack_u16(x1, y1), &mut last);
             s.store(p.z, &mut depths);
-            s.store(s.mul(width, height), &mut tiles);
+            s.store(s.keep(p.visible, s.mul(width, height)), &mut tiles);
+            let slots = &mut self.first_slots[i * LANES..=(i + 1) * LANES];
+            slots[0] = chunk.slots as u32;
+            for lane in 0..LANES {
+                slots[lane + 1] = slots[lane] + tiles[lane] as u32;
+            }
+            chunk.slots = slots[LANES] as usize;
             let mut bits = bits;
             while bits != 0 {
                 let lane = bits.trailing_zeros() as usize;
                 bits &= bits - 1;
                 let row = &mut self.rows[i * LANES + lane].0;
                 s.store(columns[lane], row);
-                row[SLOT] = f32::from_bits(chunk.slots as u32);
+                row[SLOT] = f32::from_bits(slots[lane]);
                 let key = depths[lane].to_bits();
                 self.items[chunk.items] = Item {
                     key,
@@ -409,7 +424,6 @@ impl Kernel for ProjectChunk<'_> {
                     last: last[lane].to_bits(),
                 };
                 chunk.items += 1;
-                chunk.slots += tiles[lane] as usize;
                 chunk.key_min = chunk.key_min.min(key);
                 chunk.key_max = chunk.key_max.max(key);
             }

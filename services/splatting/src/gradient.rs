@@ -3,7 +3,6 @@
 use crate::backward::MOMENTS;
 use crate::blend::prefetch;
 use crate::frame::Frame;
-use crate::frame::Row;
 use crate::model::{
     Block, LANES, Lanes, ROW_LOG_SCALE, ROW_MEAN, ROW_OPACITY, ROW_ROTATION, ROW_SH, ROWS, SH_C0, SH_REST_MAX,
 };
@@ -26,17 +25,17 @@ pub(crate) struct BlockGradient<S: Simd> {
     pub scales: [S::F; 3],
 }
 
-/// Place of a slot whose tile the splat changed nothing in.
-pub(crate) const UNTOUCHED: u32 = u32::MAX;
+/// Place of a slot whose tile the splat changed nothing in: there are zeros.
+pub(crate) const UNTOUCHED: u32 = 0;
 /// How many slots ahead sums are asked for: those of neighbours are apart, in the depth order of their tiles.
-const AHEAD: usize = 48;
+const AHEAD: usize = 32;
 
 /// What the backward blend left behind.
 #[derive(Clone, Copy)]
 pub(crate) struct Partials<'a> {
     /// Moments of every (tile, splat), tile after tile.
-    pub sums: &'a [Row],
-    /// For every slot, where its moments are, or [`UNTOUCHED`].
+    pub sums: &'a [f32],
+    /// For every slot, and behind them all, where its moments are or [`UNTOUCHED`].
     pub places: &'a [u32],
 }
 
@@ -51,25 +50,33 @@ pub(crate) fn block_gradient<S: Simd, const BANDS: bool>(
     block_index: usize,
     (block, rest): (&Block, &[Lanes]),
 ) -> Option<BlockGradient<S>> {
-    let visible = frame.visible[block_index];
     let zero = s.splat(0.0);
     let mut rows = [zero; 16];
     let mut drawn = 0_u16;
-    let mut bits = visible;
-    while bits != 0 {
-        let lane = bits.trailing_zeros() as usize;
-        bits &= bits - 1;
-        let footprint = frame.footprint(block_index * LANES + lane);
-        let range = footprint.slot..footprint.slot + footprint.width * footprint.height;
-        for slot in range {
-            if let Some(&next) = partials.places.get(slot + AHEAD) {
-                prefetch(partials.sums.get(next as usize));
+    let (first, base) = frame.block_slots(block_index);
+    let nowhere = frame.slots;
+    let mut add = |lane: usize, slot: usize| {
+        let place = partials.places[slot];
+        // Lanes beyond the moments hold those of a neighbour, and nobody asks for them.
+        if let Some(sum) = partials.sums[place as usize * MOMENTS..].first_chunk() {
+            rows[lane] = s.add(rows[lane], s.load(sum));
+        }
+        drawn |= u16::from(place != UNTOUCHED) << lane;
+    };
+    for lane in 0..LANES {
+        let (from, to) = (base + first[lane] as usize, base + first[lane + 1] as usize);
+        for ahead in 0..2 {
+            if let Some(&next) = partials.places.get(from + AHEAD + ahead) {
+                prefetch(partials.sums.get(next as usize * MOMENTS));
             }
-            let place = partials.places[slot];
-            if place != UNTOUCHED {
-                rows[lane] = s.add(rows[lane], s.load(&partials.sums[place as usize].0));
-                drawn |= 1 << lane;
-            }
+        }
+        // Most splats touch one, two or four tiles: without a loop, whose end would be mispredicted.
+        for k in 0..4 {
+            let slot = from + k;
+            add(lane, if slot < to { slot } else { nowhere });
+        }
+        for slot in from + 4..to {
+            add(lane, slot);
         }
     }
     if drawn == 0 {

@@ -7,9 +7,10 @@
 #![expect(unsafe_code, reason = "tasks write disjoint parts of shared buffers")]
 
 use crate::frame::{LAST, Plane, TILE, TilePixels};
+use crate::model::Lanes;
 use crate::settings::{LossTerms, TrainingSettings};
 use crate::simd::{Isa, Kernel, Simd, dispatch};
-use crate::ssim::{self, Maps, SsimBackward, SsimForward};
+use crate::ssim::{self, Maps, Needed, Strip};
 use crate::view::{TargetTile, TrainingView};
 use crate::workers::{PerWorker, Shared, Workers};
 
@@ -21,7 +22,7 @@ pub(crate) const DEPTH_ALPHA_MIN: f32 = 0.5;
 pub(crate) struct LossImages {
     composited: Vec<[Plane; 3]>,
     maps: Vec<[Maps; 3]>,
-    similarity: Vec<[Plane; 3]>,
+    needed: Vec<Needed>,
     /// By tile: gradients of the four channels before the background, and of alpha.
     pub gradients: Vec<TilePixels>,
     sums: Vec<TileSums>,
@@ -51,7 +52,6 @@ impl LossImages {
         let tiles = (width.div_ceil(TILE), height.div_ceil(TILE));
         let count = tiles.0 * tiles.1;
         self.composited.resize(count, [Plane::ZERO; 3]);
-        self.similarity.resize(count, [Plane::ZERO; 3]);
         self.gradients.resize(count, [Plane::ZERO; 5]);
         self.sums.resize(count, TileSums::default());
         let window = ssim::window();
@@ -65,10 +65,9 @@ impl LossImages {
                 dispatch(isa, Composite { pixels: &pixels[tile], target: &view.tiles[tile], background, out });
             }
         });
+        self.rows.clear();
         if settings.ssim_weight != 0.0 {
             self.similarity(isa, workers, scratch, view, tiles, &window);
-        } else {
-            self.rows.clear();
         }
         let samples = (3 * width * height) as f32;
         let per = |weight: f32, count: usize| if count == 0 { 0.0 } else { weight / count as f32 };
@@ -80,16 +79,22 @@ impl LossImages {
         };
         let gradients = Shared::new(&mut self.gradients);
         let sums = Shared::new(&mut self.sums);
-        let (composited, similarity) = (&self.composited, &self.similarity);
+        let (composited, maps, needed) = (&self.composited, &self.maps, &self.needed);
         workers.run(tiles.1, |_, ty| {
             for tile in ty * tiles.0..(ty + 1) * tiles.0 {
                 // SAFETY: one task per row of tiles.
                 let out = unsafe { &mut gradients.slice_mut(tile..tile + 1)[0] };
+                let similarity = (settings.ssim_weight != 0.0 && needed[tile].gradient).then(|| SimilarityMaps {
+                    window: &window,
+                    above: tile.checked_sub(tiles.0).map(|tile| &maps[tile]),
+                    here: &maps[tile],
+                    below: maps.get(tile + tiles.0),
+                });
                 let kernel = GradientTile {
                     pixels: &pixels[tile],
                     target: &view.tiles[tile],
                     composited: &composited[tile],
-                    similarity: &similarity[tile],
+                    similarity,
                     weights: &weights,
                     background,
                     out,
@@ -113,25 +118,18 @@ impl LossImages {
         self.maps.resize(tiles.0 * tiles.1, [[Plane::ZERO; 3]; 3]);
         self.rows.resize(tiles.1, 0.0);
         let target = &view.tiles[..];
-        let rendered = &self.composited[..];
+        ssim::needed(target, tiles, &mut self.needed);
+        let (rendered, needed) = (&self.composited[..], &self.needed[..]);
+        let size = (view.camera().width as usize, view.camera().height as usize);
         let maps = Shared::new(&mut self.maps);
         let rows = Shared::new(&mut self.rows);
         workers.run(tiles.1, |worker, ty| {
             // SAFETY: one task per row of tiles.
             let maps = unsafe { maps.slice_mut(ty * tiles.0..(ty + 1) * tiles.0) };
             scratch.with(worker, |scratch| {
-                let sum = dispatch(isa, SsimForward { window, tiles, ty, rendered, target, scratch, maps });
+                let sum = dispatch(isa, Strip { window, tiles, ty, size, rendered, target, needed, scratch, maps });
                 // SAFETY: as above.
                 unsafe { rows.write(ty, sum) };
-            });
-        });
-        let maps = &self.maps[..];
-        let gradients = Shared::new(&mut self.similarity);
-        workers.run(tiles.1, |worker, ty| {
-            // SAFETY: one task per row of tiles.
-            let gradients = unsafe { gradients.slice_mut(ty * tiles.0..(ty + 1) * tiles.0) };
-            scratch.with(worker, |scratch| {
-                dispatch(isa, SsimBackward { window, tiles, ty, rendered, target, maps, scratch, gradients });
             });
         });
     }
@@ -194,12 +192,20 @@ struct Weights {
     free: f32,
 }
 
+/// Where the gradient of the similarity comes from: the maps of a tile and of those above and below it.
+struct SimilarityMaps<'a> {
+    window: &'a [f32; 11],
+    above: Option<&'a [Maps; 3]>,
+    here: &'a [Maps; 3],
+    below: Option<&'a [Maps; 3]>,
+}
+
 struct GradientTile<'a> {
     pixels: &'a TilePixels,
     target: &'a TargetTile,
     composited: &'a [Plane; 3],
-    /// Gradient of the summed similarity.
-    similarity: &'a [Plane; 3],
+    /// `None` where the similarity has no gradient.
+    similarity: Option<SimilarityMaps<'a>>,
     weights: &'a Weights,
     background: [f32; 3],
     out: &'a mut TilePixels,
@@ -213,6 +219,14 @@ impl Kernel for GradientTile<'_> {
         let zero = s.splat(0.0);
         let one = s.splat(1.0);
         let (mut l1, mut squared, mut depth_sum, mut free_sum) = (zero, zero, zero, zero);
+        let mut similarity = [[Lanes([0.0; TILE]); TILE]; 3];
+        if let Some(from) = &self.similarity {
+            for k in 0..3 {
+                let maps = [from.above.map(|maps| &maps[k]), Some(&from.here[k]), from.below.map(|maps| &maps[k])];
+                let (rendered, target) = (&self.composited[k], &self.target.color[k]);
+                ssim::similarity_gradient(s, from.window, maps, rendered, target, &mut similarity[k]);
+            }
+        }
         for y in 0..TILE {
             let foreground = s.mask(self.target.foreground[y]);
             let alpha = s.sub(one, s.load(self.pixels[LAST].row(y)));
@@ -222,7 +236,7 @@ impl Kernel for GradientTile<'_> {
                 l1 = s.add(l1, s.abs(difference));
                 squared = s.fma(difference, difference, squared);
                 let d = s.mul(sign(s, difference), s.splat(self.weights.l1));
-                let d = s.fnma(s.load(self.similarity[k].row(y)), s.splat(self.weights.ssim), d);
+                let d = s.fnma(s.load(&similarity[k][y].0), s.splat(self.weights.ssim), d);
                 let d = s.keep(foreground, d);
                 d_alpha = s.fnma(d, s.splat(self.background[k]), d_alpha);
                 store(s, d, &mut self.out[k], y);

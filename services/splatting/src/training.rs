@@ -4,7 +4,7 @@
 
 use std::time::Instant;
 
-use crate::backward::{BackwardTile, TOUCHED};
+use crate::backward::{BackwardTile, MOMENTS, TOUCHED};
 use crate::engine::Engine;
 use crate::frame::{Frame, TILE};
 use crate::gradient::{BlockGradient, Partials, UNTOUCHED, block_gradient};
@@ -155,23 +155,23 @@ impl Engine {
 
     pub(crate) fn backward(&mut self, settings: &TrainingSettings) {
         let frame = &self.frame;
-        // Every tile has one more sum than entries, for the row that fills up its kernel's last step.
-        let length = frame.entries.len() + frame.tiles();
+        // The first place is that of no splat and stays zero; behind the last there is room for a vector.
+        let length = (frame.entries.len() + 1) * MOMENTS + LANES;
         if self.sums.len() < length {
             // A quarter more than needed: the number changes from view to view.
-            self.sums.resize(length + length / 4, Lanes([0.0; LANES]));
+            self.sums.resize(length + length / 4, 0.0);
         }
         self.places.clear();
-        self.places.resize(frame.slots, UNTOUCHED);
+        self.places.resize(frame.slots + 1, UNTOUCHED);
         let sums = Shared::new(&mut self.sums);
         let places = Shared::new(&mut self.places);
         self.workers.run(frame.tiles(), |worker, task| {
             let tile = frame.schedule[task] as usize;
             let (tile_x, tile_y) = (tile % frame.tiles_x, tile / frame.tiles_x);
             let entries = frame.tile_entries(tile);
-            let first = frame.starts[tile] as usize + tile;
+            let first = frame.starts[tile] as usize + 1;
             // SAFETY: the ranges of different tiles do not overlap, and each tile is given to one task.
-            let sums = unsafe { sums.slice_mut(first..first + entries.len() + 1) };
+            let sums = unsafe { sums.slice_mut(first * MOMENTS..(first + entries.len()) * MOMENTS) };
             self.backward_scratch.with(worker, |scratch| {
                 let contributors = &self.contributors[tile];
                 let kernel = BackwardTile {
@@ -183,15 +183,17 @@ impl Engine {
                     gradients: &self.loss.gradients[tile],
                     alpha_min: settings.render.alpha_min,
                     scratch: &mut *scratch,
-                    sums: &mut *sums,
                 };
                 dispatch(self.isa, kernel);
-                let used = entries.iter().take(contributors.used).zip(sums).zip(&scratch.rows);
-                for (i, ((&gaussian, sum), row)) in used.enumerate() {
+                let used = entries.iter().take(contributors.used).zip(&scratch.sums).zip(&scratch.rows);
+                let mut kept = 0;
+                for ((&gaussian, sum), row) in used {
                     if sum.0[TOUCHED] > 0.0 {
+                        sums[kept * MOMENTS..][..MOMENTS].copy_from_slice(&sum.0[..MOMENTS]);
                         let slot = frame.footprint_of(gaussian as usize, row).slot_in(tile_x, tile_y);
                         // SAFETY: every (tile, Gaussian) has a slot of its own, and each tile is given to one task.
-                        unsafe { places.write(slot, (first + i) as u32) };
+                        unsafe { places.write(slot, (first + kept) as u32) };
+                        kept += 1;
                     }
                 }
             });
