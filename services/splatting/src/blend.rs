@@ -38,7 +38,7 @@ pub(crate) struct Scratch {
 
 impl Default for Scratch {
     fn default() -> Self {
-        Self { rows: vec![Lanes([0.0; 16]); BATCH + 1], lists: Box::new([[0; LIST]; BLOCKS]) }
+        Self { rows: vec![Lanes([0.0; 16]); BATCH + 16], lists: Box::new([[0; LIST]; BLOCKS]) }
     }
 }
 
@@ -107,6 +107,12 @@ pub(crate) fn alpha_at<S: Simd>(s: S, row: &[f32; 16], px: S::F, py: S::F, alpha
     (s.keep(counts, alpha), counts)
 }
 
+/// The nearest pixel centre of the four from `low` on.
+#[inline(always)]
+fn clamp<S: Simd>(s: S, x: S::F, low: f32) -> S::F {
+    s.min(s.max(x, s.splat(low)), s.splat(low + 3.0))
+}
+
 impl Kernel for BlendTile<'_> {
     type Output = ();
 
@@ -152,52 +158,64 @@ impl Kernel for BlendTile<'_> {
 
 impl BlendTile<'_> {
     /// Copies a batch's rows next to each other and lists, for each living block, the splats that reach it.
+    ///
+    /// Sixteen splats are tested against one block at a time: what depends on the column or the row of blocks alone is
+    /// shared by four tests, and a comparison is the list's selection.
     #[inline(always)]
     fn gather<S: Simd>(&mut self, s: S, batch: &[u32], alive: u16) -> [usize; BLOCKS] {
         let mut counts = [0; BLOCKS];
-        // Lanes are blocks: low and high pixel centres of each.
-        let [left, top] = [self.origin[0] as f32, self.origin[1] as f32];
-        let low = [
-            s.load(&build!(0.0; 16; |i| left + (i % 4 * 4) as f32 + 0.5)),
-            s.load(&build!(0.0; 16; |i| top + (i / 4 * 4) as f32 + 0.5)),
-        ];
-        let three = s.splat(3.0);
-        let high = [s.add(low[0], three), s.add(low[1], three)];
-        let mut hits = [0_u32; 16];
-        for (i, &gaussian) in batch.iter().enumerate() {
-            prefetch(batch.get(i + PREFETCH).map(|&g| &self.rows[g as usize]));
-            let mut row = self.rows[gaussian as usize].0;
-            if let Channels::Moments { reference_m } = self.channels {
-                let depth = row[CHANNELS + 3] - reference_m;
-                row[CHANNELS] = depth;
-                row[CHANNELS + 1] = depth * depth;
-            }
-            self.scratch.rows[i].0 = row;
-            // The least exponent over a block lies at the mean, or on the nearer vertical or horizontal edge.
-            let (mx, my) = (s.splat(row[X]), s.splat(row[Y]));
-            let dx = s.sub(s.min(s.max(mx, low[0]), high[0]), mx);
-            let dy = s.sub(s.min(s.max(my, low[1]), high[1]), my);
-            let (a, b2, c) = (s.splat(row[A]), s.splat(row[B2]), s.splat(row[C]));
-            let free_y = s.fnma(dx, s.splat(row[B_BY_C]), my);
-            let free_x = s.fnma(dy, s.splat(row[B_BY_A]), mx);
-            let vy = s.sub(s.min(s.max(free_y, low[1]), high[1]), my);
-            let hx = s.sub(s.min(s.max(free_x, low[0]), high[0]), mx);
-            let vertical = s.fma(dx, s.fma(vy, b2, s.mul(dx, a)), s.mul(vy, s.mul(vy, c)));
-            let horizontal = s.fma(hx, s.fma(dy, b2, s.mul(hx, a)), s.mul(dy, s.mul(dy, c)));
-            let least = s.min(vertical, horizontal);
-            let reach = s.splat(row[THRESHOLD] * 1.0001 + 1e-3);
-            hits[i % 16] = u32::from(s.bits(s.ge(reach, least)) & alive);
-            if i % 16 == 15 {
-                s.append_hits(&hits, i as u16 - 15, &mut self.scratch.lists, &mut counts);
-                hits = [0; 16];
-            }
-        }
-        if !batch.len().is_multiple_of(16) {
-            s.append_hits(&hits, (batch.len() / 16 * 16) as u16, &mut self.scratch.lists, &mut counts);
-        }
-        // The row after the batch changes nothing: it fills lists up to a multiple of what is evaluated together.
+        let [left, top] = [self.origin[0] as f32 + 0.5, self.origin[1] as f32 + 0.5];
+        let zero = s.splat(0.0);
+        // The row after the batch changes nothing and reaches no block. It fills up the last sixteen, and lists up to a
+        // multiple of what is evaluated together.
         let mut nothing = [0.0; 16];
         nothing[LOG2_ALPHA] = -200.0;
+        nothing[THRESHOLD] = -1e9;
+        for (group, sixteen) in batch.chunks(16).enumerate() {
+            let mut columns = [zero; 16];
+            for i in 0..16 {
+                let position = group * 16 + i;
+                prefetch(batch.get(position + PREFETCH).map(|&g| &self.rows[g as usize]));
+                let row = if i < sixteen.len() { &self.rows[sixteen[i] as usize].0 } else { &nothing };
+                columns[i] = s.load(row);
+                let copy = &mut self.scratch.rows[position].0;
+                s.store(columns[i], copy);
+                if let Channels::Moments { reference_m } = self.channels {
+                    let depth = row[CHANNELS + 3] - reference_m;
+                    copy[CHANNELS] = depth;
+                    copy[CHANNELS + 1] = depth * depth;
+                }
+            }
+            s.transpose(&mut columns);
+            let [mx, my, a, b2, c] = [columns[X], columns[Y], columns[A], columns[B2], columns[C]];
+            let (b_by_a, b_by_c) = (columns[B_BY_A], columns[B_BY_C]);
+            let reach = s.fma(columns[THRESHOLD], s.splat(1.0001), s.splat(1e-3));
+            // From the mean to the nearest pixels of each row of blocks; where along that row the exponent is least.
+            let dy = build!(zero; 4; |j| s.sub(clamp(s, my, top + (4 * j) as f32), my));
+            let free_x = build!(zero; 4; |j| s.fnma(dy[j], b_by_a, mx));
+            let by = build!(zero; 4; |j| s.mul(dy[j], b2));
+            let cyy = build!(zero; 4; |j| s.mul(dy[j], s.mul(dy[j], c)));
+            for i in 0..4 {
+                let block_left = left + (4 * i) as f32;
+                let dx = s.sub(clamp(s, mx, block_left), mx);
+                let free_y = s.fnma(dx, b_by_c, my);
+                let (bx, axx) = (s.mul(dx, b2), s.mul(dx, s.mul(dx, a)));
+                for j in 0..4 {
+                    let block = 4 * j + i;
+                    if alive >> block & 1 == 0 {
+                        continue;
+                    }
+                    // The least exponent over a block lies at the mean, or on the nearer vertical or horizontal edge.
+                    let vy = s.sub(clamp(s, free_y, top + (4 * j) as f32), my);
+                    let vertical = s.fma(vy, s.fma(vy, c, bx), axx);
+                    let hx = s.sub(clamp(s, free_x[j], block_left), mx);
+                    let horizontal = s.fma(hx, s.fma(hx, a, by[j]), cyy[j]);
+                    let hits = s.ge(reach, s.min(vertical, horizontal));
+                    let list = &mut self.scratch.lists[block];
+                    counts[block] += s.append(hits, 16 * group as u16, &mut list[counts[block]..]);
+                }
+            }
+        }
         self.scratch.rows[batch.len()].0 = nothing;
         for (list, &count) in self.scratch.lists.iter_mut().zip(&counts) {
             list[count..count + TOGETHER].fill(batch.len() as u16);

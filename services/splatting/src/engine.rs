@@ -314,14 +314,17 @@ fn blend_frame(
 
 fn copy_moments(frame: &Frame, camera: &Camera, reference_m: f32, out: &mut Moments) {
     (out.width, out.height, out.reference_m) = (camera.width, camera.height, reference_m);
-    out.alpha.clear();
-    out.first.clear();
-    out.second.clear();
-    for_each_pixel(frame, camera, |tile, at| {
-        out.alpha.push(1.0 - tile[LAST].0[at]);
-        out.first.push(tile[0].0[at]);
-        out.second.push(tile[1].0[at]);
-    });
+    let width = camera.width as usize;
+    for (plane, to) in [LAST, 0, 1].into_iter().zip([&mut out.alpha, &mut out.first, &mut out.second]) {
+        to.resize(camera.pixels(), 0.0);
+        for (y, line) in to.chunks_exact_mut(width.max(1)).enumerate() {
+            let tiles = &frame.pixels[y / TILE * frame.tiles_x..];
+            for (part, tile) in line.chunks_mut(TILE).zip(tiles) {
+                part.copy_from_slice(&tile[plane].row(y % TILE)[..part.len()]);
+            }
+        }
+    }
+    out.alpha.iter_mut().for_each(|transmittance| *transmittance = 1.0 - *transmittance);
 }
 
 fn for_each_pixel(frame: &Frame, camera: &Camera, mut f: impl FnMut(&crate::frame::TilePixels, usize)) {

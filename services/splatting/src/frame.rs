@@ -199,7 +199,9 @@ impl Frame {
         let total: usize = self.chunks.iter().map(|chunk| chunk.items).sum();
         let mut packed = 0;
         for (index, chunk) in self.chunks.iter().enumerate() {
-            self.items.copy_within(index * CHUNK..index * CHUNK + chunk.items, packed);
+            if packed != index * CHUNK {
+                self.items.copy_within(index * CHUNK..index * CHUNK + chunk.items, packed);
+            }
             packed += chunk.items;
         }
         self.sorted.resize(self.items.len(), Item::default());

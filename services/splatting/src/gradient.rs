@@ -23,6 +23,29 @@ pub(crate) struct BlockGradient<S: Simd> {
     pub lanes: S::M,
     /// Standard deviations, metres.
     pub scales: [S::F; 3],
+    pub screen: Screen<S>,
+}
+
+/// What the statistics of the screen are made of; costs nothing where it is not used.
+pub(crate) struct Screen<S: Simd> {
+    /// Gradient by the mean's position, per pixel.
+    pub gradient: [S::F; 2],
+    /// Covariance with the low-pass (a, b, c), px².
+    pub covariance: [S::F; 3],
+    /// Lanes that were projected into the image.
+    pub visible: S::M,
+    /// Lanes with a gradient.
+    pub moved: S::M,
+}
+
+impl<S: Simd> BlockGradient<S> {
+    /// No lane has a gradient.
+    #[inline(always)]
+    pub(crate) fn zero(s: S) -> Self {
+        let (zero, none) = (s.splat(0.0), s.mask(0));
+        let screen = Screen { gradient: [zero; 2], covariance: [zero; 3], visible: none, moved: none };
+        Self { rows: [zero; ROWS], bands: None, lanes: none, scales: [zero; 3], screen }
+    }
 }
 
 /// Place of a slot whose tile the splat changed nothing in: there are zeros.
@@ -41,8 +64,10 @@ pub(crate) struct Partials<'a> {
 
 /// Sums a block's partials over tiles, in the order of the tiles, and takes them through the projection. `rest` are the
 /// rows of higher bands that are evaluated; without `BANDS`, which costs nothing then, there are none.
+///
+/// `None` where none of the block's Gaussians changed a pixel, or with `OBSERVED` where none was projected into the image.
 #[inline(always)]
-pub(crate) fn block_gradient<S: Simd, const BANDS: bool>(
+pub(crate) fn block_gradient<S: Simd, const BANDS: bool, const OBSERVED: bool>(
     s: S,
     view: &View,
     frame: &Frame,
@@ -79,13 +104,14 @@ pub(crate) fn block_gradient<S: Simd, const BANDS: bool>(
             add(lane, slot);
         }
     }
-    if drawn == 0 {
+    let visible = if OBSERVED { frame.visible[block_index] } else { drawn };
+    if visible == 0 {
         return None;
     }
     s.transpose(&mut rows);
     let moments = build!(zero; MOMENTS; |i| rows[i]);
-    let projected = project(s, view, block, drawn);
-    let mut rows = parameter_gradients(s, view, &projected, &moments);
+    let projected = project(s, view, block, visible);
+    let (mut rows, d_mean) = parameter_gradients(s, view, &projected, &moments);
     let mut bands = None;
     if BANDS {
         let d_color = [moments[6], moments[7], moments[8]];
@@ -96,12 +122,21 @@ pub(crate) fn block_gradient<S: Simd, const BANDS: bool>(
         size = s.add(size, s.abs(g));
     }
     let lanes = s.and(s.mask(drawn), s.gt(s.splat(GRADIENT_MAX), size));
-    Some(BlockGradient { rows, bands, lanes, scales: projected.scales })
+    let low_pass = s.splat(view.low_pass());
+    let [a, b, c] = projected.raw;
+    let covariance = [s.add(a, low_pass), b, s.add(c, low_pass)];
+    let screen = Screen { gradient: d_mean, covariance, visible: s.mask(visible), moved: lanes };
+    Some(BlockGradient { rows, bands, lanes, scales: projected.scales, screen })
 }
 
-/// Chain rule from the ten moments to the fourteen parameters.
+/// Chain rule from the ten moments to the fourteen parameters, and to the mean's position in pixels.
 #[inline(always)]
-fn parameter_gradients<S: Simd>(s: S, view: &View, p: &Projected<S>, moments: &[S::F; MOMENTS]) -> [S::F; ROWS] {
+fn parameter_gradients<S: Simd>(
+    s: S,
+    view: &View,
+    p: &Projected<S>,
+    moments: &[S::F; MOMENTS],
+) -> ([S::F; ROWS], [S::F; 2]) {
     let [h, hx, hy, hxx, hxy, hyy, red, green, blue, depth] = *moments;
     let zero = s.splat(0.0);
     let half = s.splat(0.5);
@@ -180,7 +215,7 @@ fn parameter_gradients<S: Simd>(s: S, view: &View, p: &Projected<S>, moments: &[
     for (k, d_color) in [red, green, blue].into_iter().enumerate() {
         out[ROW_SH + k] = s.mul(s.splat(SH_C0), d_color);
     }
-    out
+    (out, d_mean)
 }
 
 /// Gradient of a unit quaternion (x, y, z, w) from that of its rotation matrix.

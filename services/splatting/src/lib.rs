@@ -11,21 +11,26 @@ mod backward;
 mod blend;
 mod camera;
 pub mod checkpoint;
+mod densify;
 mod engine;
 mod frame;
 mod gradient;
+mod initial;
 mod loss;
 pub mod metrics;
 mod model;
+mod neighbours;
 mod optimiser;
 pub mod ply;
 mod projection;
 pub mod reference;
+mod schedule;
 mod settings;
 mod sh;
 mod simd;
 mod sort;
 mod ssim;
+mod statistics;
 #[cfg(test)]
 mod tests;
 mod training;
@@ -33,10 +38,16 @@ mod view;
 mod workers;
 
 pub use camera::{Camera, Pose, RenderSettings};
+pub use densify::{
+    DefaultSettings, Densifier, DensifierState, DensifyError, DensifyReport, McmcSettings, Relocation, Strategy,
+};
 pub use engine::{DEPTH_ALPHA_TINY, Engine, EngineError, Moments, MomentsView, Rendered, Work};
+pub use initial::{ColoredPoint, InitialError, InitialGaussians, random_points};
 pub use model::{Gaussian, Gaussians, SH_C0, SH_DEGREE_MAX, SH_REST_MAX, sh_rest_coefficients};
 pub use optimiser::Optimiser;
+pub use schedule::{Schedule, scene_extent};
 pub use settings::{LossTerms, TrainingSettings};
 pub use simd::Isa;
+pub use statistics::{ScreenStatistics, StatisticsError};
 pub use training::{Gradient, ParameterGradient};
 pub use view::{PixelClass, TrainingView, ViewError};

@@ -150,6 +150,8 @@ impl LossImages {
             depth_m: per(sum.depth, view.with_depth),
             free_alpha: per(sum.free_alpha, view.free),
             isotropic_m: 0.0,
+            opacity: 0.0,
+            scale_m: 0.0,
             foreground_mse: per(sum.squared, 3 * view.foreground),
             total: 0.0,
         }

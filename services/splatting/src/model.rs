@@ -303,6 +303,10 @@ impl Gaussians {
         &self.blocks
     }
 
+    pub(crate) fn blocks_mut_and_ids(&mut self) -> (&mut [Block], &[u64]) {
+        (&mut self.blocks, &self.ids)
+    }
+
     /// Rows of the higher bands of one block.
     pub(crate) fn rest_rows(&self, block: usize) -> &[Lanes] {
         let rows = sh_rest_rows(self.sh_degree);

@@ -83,6 +83,27 @@ impl Optimiser {
         self.select(order);
     }
 
+    /// Forgets moments and step count of one Gaussian, as for one that has just been added.
+    ///
+    /// # Panics
+    /// Where `index >= len()`, as a slice does.
+    pub fn reset(&mut self, index: usize) {
+        self.steps[index] = 0;
+        let (block, lane) = (index / LANES, index % LANES);
+        let rows = sh_rest_rows(self.sh_degree);
+        let rest = block * rows..(block + 1) * rows;
+        let first = self.first[block].0.iter_mut().chain(&mut self.first_rest[rest.clone()]);
+        let second = self.second[block].0.iter_mut().chain(&mut self.second_rest[rest]);
+        first.chain(second).for_each(|row| row.0[lane] = 0.0);
+    }
+
+    /// Forgets the moments of all opacities, not the step counts, as 3DGS does when it resets opacities.
+    pub fn reset_opacities(&mut self) {
+        for block in self.first.iter_mut().chain(&mut self.second) {
+            block.0[ROW_OPACITY] = Lanes([0.0; LANES]);
+        }
+    }
+
     fn select(&mut self, from: &[u32]) {
         self.first = select_lanes(&self.first, from);
         self.second = select_lanes(&self.second, from);

@@ -68,6 +68,11 @@ impl View {
         }
     }
 
+    /// Variance added to both axes of the screen, px².
+    pub(crate) fn low_pass(&self) -> f32 {
+        self.low_pass
+    }
+
     /// Whether opacity is compensated for the low-pass.
     pub(crate) fn compensated(&self) -> bool {
         self.compensation

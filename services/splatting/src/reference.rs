@@ -13,7 +13,7 @@ use glam::{DMat3, DQuat, DVec2, DVec3};
 
 use crate::camera::{Camera, RenderSettings};
 use crate::frame::TILE;
-use crate::model::{Gaussians, ROW_OPACITY, ROW_SH, ROWS, SH_REST_MAX, sh_rest_coefficients};
+use crate::model::{Gaussians, ROW_LOG_SCALE, ROW_OPACITY, ROW_SH, ROWS, SH_REST_MAX, sh_rest_coefficients};
 use crate::projection::{ALPHA_MAX, JACOBIAN_MARGIN};
 use crate::settings::TrainingSettings;
 use crate::sh;
@@ -216,7 +216,7 @@ impl Projection {
         Some(Self {
             color: DVec3::splat(0.5) + bands.map(|(k, value)| value * at(ROW_SH + 3 * k)).sum::<DVec3>(),
             conic: [c / determinant, -b / determinant, a / determinant],
-            opacity: 1.0 / (1.0 + (-parameters[ROW_OPACITY]).exp()),
+            opacity: logistic(parameters[ROW_OPACITY]),
             distance: from_eye.length(),
             r,
             p,
@@ -255,7 +255,17 @@ pub fn loss(parameters: &[Parameters], view: &TrainingView, settings: &TrainingS
     });
     let weight = f64::from(settings.isotropic_weight) / (3 * parameters.len().max(1)) as f64;
     let isotropic: f64 = (0..parameters.len()).filter(|&i| drawn[i]).map(|i| anisotropy(&parameters[i]).0).sum();
-    image_loss(&pixels, view, settings).0 + weight * isotropic
+    let mean = |sum: f64, each: usize| sum / (each * parameters.len().max(1)) as f64;
+    let opacity: f64 = parameters.iter().map(|p| logistic(p[ROW_OPACITY])).sum();
+    let scale: f64 = parameters.iter().flat_map(|p| &p[ROW_LOG_SCALE..ROW_LOG_SCALE + 3]).map(|s| s.exp()).sum();
+    image_loss(&pixels, view, settings).0
+        + weight * isotropic
+        + f64::from(settings.opacity_weight) * mean(opacity, 1)
+        + f64::from(settings.scale_weight) * mean(scale, 3)
+}
+
+fn logistic(x: f64) -> f64 {
+    1.0 / (1.0 + (-x).exp())
 }
 
 /// Σ |s - mean(s)| over a Gaussian's standard deviations, and its gradient by their logarithms.

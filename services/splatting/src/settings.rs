@@ -34,6 +34,12 @@ pub struct TrainingSettings {
     pub free_weight: f32,
     /// Weight of mean |s - mean(s)| over standard deviations, per metre (paper Eq. 7); 0 but in the paper's preset.
     pub isotropic_weight: f32,
+    /// Weight of the mean opacity of all Gaussians: 0.01 in 3DGS-MCMC (Kheradmand et al. 2024, section 4.4). With this
+    /// weight or the next every Gaussian has a gradient, so that all of them take a step, also those out of sight: what no
+    /// view holds on to fades.
+    pub opacity_weight: f32,
+    /// Weight of the mean standard deviation of all Gaussians, per metre: 0.01 in 3DGS-MCMC.
+    pub scale_weight: f32,
     /// Smallest and largest standard deviation, metres, enforced after each step (A30); `None`: only against overflow.
     pub sigma_limits_m: Option<(f32, f32)>,
 }
@@ -55,6 +61,8 @@ impl Default for TrainingSettings {
             depth_weight: 0.1,
             free_weight: 0.5,
             isotropic_weight: 0.0,
+            opacity_weight: 0.0,
+            scale_weight: 0.0,
             sigma_limits_m: None,
         }
     }
@@ -73,6 +81,10 @@ pub struct LossTerms {
     pub free_alpha: f64,
     /// Mean |s - mean(s)| over the drawn Gaussians' standard deviations, per Gaussian of the model, metres.
     pub isotropic_m: f64,
+    /// Mean opacity of the model; 0 where neither it nor the scale has a weight.
+    pub opacity: f64,
+    /// Mean standard deviation of the model, metres; 0 where neither it nor the opacity has a weight.
+    pub scale_m: f64,
     /// Mean squared colour error over the foreground.
     pub foreground_mse: f64,
     /// Weighted sum: what is minimised.
@@ -91,7 +103,9 @@ impl LossTerms {
             + weight(settings.ssim_weight) * (1.0 - self.ssim)
             + weight(settings.depth_weight) * self.depth_m
             + weight(settings.free_weight) * self.free_alpha
-            + weight(settings.isotropic_weight) * self.isotropic_m;
+            + weight(settings.isotropic_weight) * self.isotropic_m
+            + weight(settings.opacity_weight) * self.opacity
+            + weight(settings.scale_weight) * self.scale_m;
         Self { total, ..self }
     }
 }

@@ -34,16 +34,35 @@ impl Item {
 pub(crate) fn sort_by_key(workers: &Workers, items: &mut [Item], spare: &mut [Item], low: u32, high: u32) {
     let range_bits = u32::BITS - high.saturating_sub(low).leading_zeros();
     let shift = range_bits.saturating_sub(2 * DIGIT_BITS);
-    pass(workers, items, spare, |item| (item.key - low) >> shift);
-    pass(workers, spare, items, |item| (item.key - low) >> (shift + DIGIT_BITS));
+    let low_digit = |item: &Item| (item.key - low >> shift) as usize % DIGITS;
+    let high_digit = |item: &Item| (item.key - low >> (shift + DIGIT_BITS)) as usize % DIGITS;
+    let parts = if items.len() < PARALLEL_FROM { 1 } else { workers.count() };
+    if parts > 1 {
+        pass(workers, parts, items, spare, low_digit);
+        pass(workers, parts, spare, items, high_digit);
+        return;
+    }
+    // On one thread the second pass counts what the first does, in another order: one look counts for both.
+    let mut counts = [[0_u32; DIGITS]; 2];
+    for item in items.iter() {
+        counts[0][low_digit(item)] += 1;
+        counts[1][high_digit(item)] += 1;
+    }
+    for counts in &mut counts {
+        let mut total = 0;
+        for count in counts {
+            total += std::mem::replace(count, total);
+        }
+    }
+    let [low_counts, high_counts] = &mut counts;
+    scatter(items, &Shared::new(spare), low_counts, low_digit);
+    scatter(spare, &Shared::new(items), high_counts, high_digit);
 }
 
-/// One stable counting pass by the low digit of `key`.
-fn pass(workers: &Workers, from: &[Item], to: &mut [Item], key: impl Fn(&Item) -> u32 + Sync) {
-    let parts = if from.len() < PARALLEL_FROM { 1 } else { workers.count() };
+/// One stable counting pass by a digit.
+fn pass(workers: &Workers, parts: usize, from: &[Item], to: &mut [Item], digit: impl Fn(&Item) -> usize + Sync) {
     let length = from.len().div_ceil(parts).max(1);
     let part = |p: usize| &from[(p * length).min(from.len())..((p + 1) * length).min(from.len())];
-    let digit = |item: &Item| key(item) as usize % DIGITS;
     let mut counts = vec![0_u32; parts * DIGITS];
     let shared = Shared::new(&mut counts);
     workers.run(parts, |_, p| {
@@ -56,8 +75,7 @@ fn pass(workers: &Workers, from: &[Item], to: &mut [Item], key: impl Fn(&Item) -
     let mut total = 0;
     for d in 0..DIGITS {
         for p in 0..parts {
-            let count = std::mem::replace(&mut counts[p * DIGITS + d], total);
-            total += count;
+            total += std::mem::replace(&mut counts[p * DIGITS + d], total);
         }
     }
     let shared = Shared::new(&mut counts);
@@ -65,13 +83,19 @@ fn pass(workers: &Workers, from: &[Item], to: &mut [Item], key: impl Fn(&Item) -
     workers.run(parts, |_, p| {
         // SAFETY: one range of counters per part.
         let next = unsafe { shared.slice_mut(p * DIGITS..(p + 1) * DIGITS) };
-        for item in part(p) {
-            let d = digit(item);
-            // SAFETY: the prefix sums give every (digit, part) a range of its own.
-            unsafe { to.write(next[d] as usize, *item) };
-            next[d] += 1;
-        }
+        scatter(part(p), &to, next, &digit);
     });
+}
+
+/// Writes each item to the next place of its digit. Prefix sums have given every digit of every part its own places.
+fn scatter(from: &[Item], to: &Shared<'_, Item>, next: &mut [u32], digit: impl Fn(&Item) -> usize) {
+    let Some(next) = next.first_chunk_mut::<DIGITS>() else { return };
+    for item in from {
+        let place = &mut next[digit(item)];
+        // SAFETY: by the prefix sums, nobody else writes this place.
+        unsafe { to.write(*place as usize, *item) };
+        *place += 1;
+    }
 }
 
 #[cfg(test)]

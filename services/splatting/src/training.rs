@@ -6,14 +6,17 @@ use std::time::Instant;
 
 use crate::backward::{BackwardTile, MOMENTS, TOUCHED};
 use crate::engine::Engine;
-use crate::frame::{Frame, TILE};
+use crate::frame::{Frame, TILE, block_lanes};
 use crate::gradient::{BlockGradient, Partials, UNTOUCHED, block_gradient};
 use crate::loss;
-use crate::model::{Block, Gaussians, LANES, Lanes, ROW_LOG_SCALE, ROW_SH, ROWS, SH_C0, SH_REST_MAX, sh_rest_rows};
+use crate::model::{
+    Block, Gaussians, LANES, Lanes, ROW_LOG_SCALE, ROW_OPACITY, ROW_SH, ROWS, SH_C0, SH_REST_MAX, sh_rest_rows,
+};
 use crate::optimiser::{AdamStep, Optimiser};
-use crate::projection::View;
+use crate::projection::{VALUE_MAX, View};
 use crate::settings::{LossTerms, TrainingSettings};
 use crate::simd::{Kernel, Simd, build, dispatch};
+use crate::statistics::{self, ScreenStatistics, observe};
 use crate::view::TrainingView;
 use crate::workers::Shared;
 
@@ -46,6 +49,31 @@ impl Engine {
         view: &TrainingView,
         settings: &TrainingSettings,
     ) -> LossTerms {
+        self.step::<false>(gaussians, optimiser, view, settings, &mut ScreenStatistics::new())
+    }
+
+    /// The same step, bit for bit, which also adds what it saw of each Gaussian to `statistics`, for densification.
+    pub fn train_step_observed(
+        &mut self,
+        gaussians: &mut Gaussians,
+        optimiser: &mut Optimiser,
+        view: &TrainingView,
+        settings: &TrainingSettings,
+        statistics: &mut ScreenStatistics,
+    ) -> LossTerms {
+        statistics.fit(gaussians);
+        self.step::<true>(gaussians, optimiser, view, settings, statistics)
+    }
+
+    /// A step; with `OBSERVED` the statistics have the length of the model, else they are not touched.
+    fn step<const OBSERVED: bool>(
+        &mut self,
+        gaussians: &mut Gaussians,
+        optimiser: &mut Optimiser,
+        view: &TrainingView,
+        settings: &TrainingSettings,
+        statistics: &mut ScreenStatistics,
+    ) -> LossTerms {
         optimiser.fit(gaussians);
         self.corrections.update(settings.betas);
         let terms = self.accumulate(gaussians, view, settings);
@@ -53,8 +81,8 @@ impl Engine {
         let pass = ParameterPass::new(self, gaussians, view, settings);
         let adam = AdamStep::new(settings, &self.corrections);
         let chunks = gaussians.blocks().len().div_ceil(CHUNK_BLOCKS);
-        let mut isotropic = vec![0.0; chunks];
-        let results = Shared::new(&mut isotropic);
+        let mut sums = vec![Sums::default(); chunks];
+        let results = Shared::new(&mut sums);
         let count = gaussians.blocks().len();
         let total = gaussians.len();
         let rows = sh_rest_rows(gaussians.sh_degree());
@@ -65,13 +93,16 @@ impl Engine {
         let first_rest = Shared::new(&mut optimiser.first_rest);
         let second_rest = Shared::new(&mut optimiser.second_rest);
         let steps = Shared::new(&mut optimiser.steps);
+        let observed = Shared::new(statistics.rows_mut());
+        let observed_rows = if OBSERVED { statistics::ROWS } else { 0 };
         self.workers.run(chunks, |_, chunk| {
             let range = chunk * CHUNK_BLOCKS..count.min((chunk + 1) * CHUNK_BLOCKS);
             let lanes = range.start * LANES..total.min(range.end * LANES);
             let bands = range.start * rows..range.end * rows;
+            let seen = range.start * observed_rows..range.end * observed_rows;
             // SAFETY: the ranges of different chunks do not overlap.
             let kernel = unsafe {
-                AdamChunk {
+                AdamChunk::<OBSERVED> {
                     pass: &pass,
                     adam: &adam,
                     start: range.start,
@@ -79,6 +110,7 @@ impl Engine {
                     first: first.slice_mut(range.clone()),
                     second: second.slice_mut(range),
                     steps: steps.slice_mut(lanes),
+                    observed: observed.slice_mut(seen),
                     rest_rows: rows,
                     rest: rest.slice_mut(bands.clone()),
                     first_rest: first_rest.slice_mut(bands.clone()),
@@ -97,7 +129,7 @@ impl Engine {
             };
         });
         self.stage_times[6] = accumulated.elapsed();
-        finish(terms, &isotropic, gaussians.len(), settings)
+        finish(terms, &sums, gaussians.len(), settings)
     }
 
     /// The loss of a view and its gradient by every parameter; nothing moves. Zero for Gaussians that change no pixel.
@@ -109,7 +141,7 @@ impl Engine {
     ) -> (LossTerms, Gradient) {
         let terms = self.accumulate(gaussians, view, settings);
         let pass = ParameterPass::new(self, gaussians, view, settings);
-        let mut isotropic = Vec::new();
+        let mut sums = Vec::new();
         let mut out = Gradient {
             parameters: vec![[0.0; ROWS]; gaussians.len()],
             sh_rest: vec![[[0.0; 3]; SH_REST_MAX]; gaussians.len()],
@@ -117,7 +149,7 @@ impl Engine {
         for (index, block) in gaussians.blocks().iter().enumerate() {
             let rest = &gaussians.rest_rows(index)[..pass.sh_rows];
             let (gradient, bands, sum) = dispatch(self.isa, GradientBlock { pass: &pass, index, block, rest });
-            isotropic.push(sum);
+            sums.push(sum);
             let first = index * LANES;
             for (lane, to) in out.parameters[first..].iter_mut().take(LANES).enumerate() {
                 *to = std::array::from_fn(|row| gradient.0[row].0[lane]);
@@ -128,7 +160,7 @@ impl Engine {
                 }
             }
         }
-        (finish(terms, &isotropic, gaussians.len(), settings), out)
+        (finish(terms, &sums, gaussians.len(), settings), out)
     }
 
     /// Renders the view, evaluates the loss, and leaves the moments of every (tile, Gaussian) in the sums.
@@ -201,10 +233,34 @@ impl Engine {
     }
 }
 
-/// Adds up the regulariser in the order of the model, and weighs the terms.
-fn finish(terms: LossTerms, isotropic: &[f64], count: usize, settings: &TrainingSettings) -> LossTerms {
-    let isotropic_m = isotropic.iter().sum::<f64>() / (3 * count.max(1)) as f64;
-    LossTerms { isotropic_m, ..terms }.weighted(settings)
+/// Sums of the regularisers over some of the model.
+#[derive(Clone, Copy, Default)]
+struct Sums {
+    isotropic: f64,
+    opacity: f64,
+    scale: f64,
+}
+
+impl std::ops::AddAssign for Sums {
+    fn add_assign(&mut self, other: Self) {
+        self.isotropic += other.isotropic;
+        self.opacity += other.opacity;
+        self.scale += other.scale;
+    }
+}
+
+/// Adds up the regularisers in the order of the model, and weighs the terms.
+fn finish(terms: LossTerms, parts: &[Sums], count: usize, settings: &TrainingSettings) -> LossTerms {
+    let mut sums = Sums::default();
+    parts.iter().for_each(|&part| sums += part);
+    let count = count.max(1) as f64;
+    LossTerms {
+        isotropic_m: sums.isotropic / (3.0 * count),
+        opacity: sums.opacity / count,
+        scale_m: sums.scale / (3.0 * count),
+        ..terms
+    }
+    .weighted(settings)
 }
 
 /// What the pass over parameters reads.
@@ -214,32 +270,46 @@ struct ParameterPass<'a> {
     partials: Partials<'a>,
     /// Rows of the higher bands that are evaluated.
     sh_rows: usize,
+    /// Gaussians of the model.
+    count: usize,
     /// Isotropic weight divided by the number of standard deviations of the model.
     isotropic: f32,
+    /// Opacity weight divided by the number of Gaussians.
+    opacity: f32,
+    /// Scale weight divided by the number of standard deviations of the model.
+    scale: f32,
 }
 
 impl<'a> ParameterPass<'a> {
     fn new(engine: &'a Engine, model: &Gaussians, view: &TrainingView, settings: &TrainingSettings) -> Self {
+        let count = model.len();
+        let (gaussians, deviations) = (count.max(1) as f32, (3 * count.max(1)) as f32);
         Self {
             view: View::new(view.camera(), &settings.render),
             frame: &engine.frame,
             partials: Partials { sums: &engine.sums, places: &engine.places },
             sh_rows: model.active_sh_rows(settings.render.sh_degree),
-            isotropic: settings.isotropic_weight / (3 * model.len().max(1)) as f32,
+            count,
+            isotropic: settings.isotropic_weight / deviations,
+            opacity: settings.opacity_weight / gaussians,
+            scale: settings.scale_weight / deviations,
         }
     }
 
-    /// Gradient of one block with the regulariser, and the regulariser's sum |s - mean(s)|.
+    /// Gradient of one block with the regularisers, and their sums.
     #[inline(always)]
-    fn block<S: Simd, const BANDS: bool>(
+    fn block<S: Simd, const BANDS: bool, const OBSERVED: bool>(
         &self,
         s: S,
         index: usize,
         block: (&Block, &[Lanes]),
-    ) -> Option<(BlockGradient<S>, f64)> {
-        let mut gradient = block_gradient::<S, BANDS>(s, &self.view, self.frame, self.partials, index, block)?;
-        let mut sum = 0.0;
-        if self.isotropic != 0.0 {
+    ) -> Option<(BlockGradient<S>, Sums)> {
+        let (view, frame, partials) = (&self.view, self.frame, self.partials);
+        let mut gradient = block_gradient::<S, BANDS, OBSERVED>(s, view, frame, partials, index, block);
+        let mut sums = Sums::default();
+        if let Some(gradient) = &mut gradient
+            && self.isotropic != 0.0
+        {
             let third = s.splat(1.0 / 3.0);
             let scales = gradient.scales;
             let mean = s.mul(s.add(s.add(scales[0], scales[1]), scales[2]), third);
@@ -249,14 +319,54 @@ impl<'a> ParameterPass<'a> {
             for k in 0..3 {
                 let d = s.mul(s.mul(s.sub(sign[k], mean_sign), scales[k]), s.splat(self.isotropic));
                 gradient.rows[ROW_LOG_SCALE + k] = s.add(gradient.rows[ROW_LOG_SCALE + k], d);
-                sum += loss::sum(s, s.keep(gradient.lanes, s.abs(difference[k])));
+                sums.isotropic += loss::sum(s, s.keep(gradient.lanes, s.abs(difference[k])));
             }
         }
-        Some((gradient, sum))
+        if self.opacity != 0.0 || self.scale != 0.0 {
+            let mut all = match gradient {
+                Some(gradient) => gradient,
+                None => BlockGradient::zero(s),
+            };
+            self.regularise(s, index, block.0, &mut all, &mut sums);
+            return Some((all, sums));
+        }
+        Some((gradient?, sums))
+    }
+
+    /// Adds the gradients of mean opacity and mean scale, which every Gaussian of the model has, drawn or not.
+    #[inline(always)]
+    fn regularise<S: Simd>(&self, s: S, index: usize, block: &Block, gradient: &mut BlockGradient<S>, sums: &mut Sums) {
+        let one = s.splat(1.0);
+        let parameter = build!(one; ROWS; |row| s.load(&block.0[row].0));
+        let opacity = s.div(one, s.add(one, s.exp(s.sub(s.splat(0.0), parameter[ROW_OPACITY]))));
+        let scales = build!(one; 3; |k| s.exp(parameter[ROW_LOG_SCALE + k]));
+        let mut size = s.add(scales[0], s.add(scales[1], scales[2]));
+        for row in parameter {
+            size = s.add(size, s.abs(row));
+        }
+        // Broken Gaussians are left alone, as they are without regularisers.
+        let whole = s.and(s.mask(block_lanes(index, self.count)), s.gt(s.splat(VALUE_MAX), size));
+        for row in &mut gradient.rows {
+            *row = s.keep(gradient.lanes, *row);
+        }
+        if let Some(bands) = &mut gradient.bands {
+            for basis in bands {
+                *basis = s.keep(gradient.lanes, *basis);
+            }
+        }
+        let d = s.mul(s.mul(opacity, s.sub(one, opacity)), s.splat(self.opacity));
+        gradient.rows[ROW_OPACITY] = s.add(gradient.rows[ROW_OPACITY], d);
+        sums.opacity += loss::sum(s, s.keep(whole, opacity));
+        for k in 0..3 {
+            let d = s.mul(scales[k], s.splat(self.scale));
+            gradient.rows[ROW_LOG_SCALE + k] = s.add(gradient.rows[ROW_LOG_SCALE + k], d);
+            sums.scale += loss::sum(s, s.keep(whole, scales[k]));
+        }
+        gradient.lanes = whole;
     }
 }
 
-struct AdamChunk<'a> {
+struct AdamChunk<'a, const OBSERVED: bool> {
     pass: &'a ParameterPass<'a>,
     adam: &'a AdamStep<'a>,
     start: usize,
@@ -264,6 +374,8 @@ struct AdamChunk<'a> {
     first: &'a mut [Block],
     second: &'a mut [Block],
     steps: &'a mut [u32],
+    /// Rows of the statistics, none where the step is not observed.
+    observed: &'a mut [Lanes],
     /// Rows of the higher bands per block, in the three that follow.
     rest_rows: usize,
     rest: &'a mut [Lanes],
@@ -274,13 +386,13 @@ struct AdamChunk<'a> {
 /// A kernel compiled with and without higher bands: at degree 0 they must not cost a register.
 struct WithBands<const BANDS: bool, K>(K);
 
-impl<const BANDS: bool> Kernel for WithBands<BANDS, AdamChunk<'_>> {
-    type Output = f64;
+impl<const BANDS: bool, const OBSERVED: bool> Kernel for WithBands<BANDS, AdamChunk<'_, OBSERVED>> {
+    type Output = Sums;
 
     #[inline(always)]
-    fn run<S: Simd>(self, s: S) -> f64 {
+    fn run<S: Simd>(self, s: S) -> Sums {
         let chunk = self.0;
-        let mut isotropic = 0.0;
+        let mut sums = Sums::default();
         let state = chunk.first.iter_mut().zip(chunk.second).zip(chunk.steps.chunks_mut(LANES));
         for (i, (block, ((first, second), steps))) in chunk.blocks.iter_mut().zip(state).enumerate() {
             let bands = match BANDS {
@@ -288,17 +400,22 @@ impl<const BANDS: bool> Kernel for WithBands<BANDS, AdamChunk<'_>> {
                 false => 0..0,
             };
             let rest = &mut chunk.rest[bands.clone()];
-            let Some((gradient, sum)) = chunk.pass.block::<S, BANDS>(s, chunk.start + i, (block, rest)) else {
+            let parameters = (&*block, &*rest);
+            let Some((gradient, sum)) = chunk.pass.block::<S, BANDS, OBSERVED>(s, chunk.start + i, parameters) else {
                 continue;
             };
-            isotropic += sum;
+            sums += sum;
             let corrections = chunk.adam.apply(s, &gradient.rows, gradient.lanes, block, (first, second, steps));
             if let Some(basis) = &gradient.bands {
                 let moments = (&mut chunk.first_rest[bands.clone()], &mut chunk.second_rest[bands]);
                 chunk.adam.apply_rest(s, (&gradient.rows, basis), (gradient.lanes, &corrections), rest, moments);
             }
+            if OBSERVED {
+                let rows = &mut chunk.observed[i * statistics::ROWS..(i + 1) * statistics::ROWS];
+                observe(s, &chunk.pass.view, &gradient.screen, rows);
+            }
         }
-        isotropic
+        sums
     }
 }
 
@@ -310,13 +427,14 @@ struct GradientBlock<'a> {
 }
 
 impl Kernel for GradientBlock<'_> {
-    type Output = (Block, [Lanes; 3 * SH_REST_MAX], f64);
+    type Output = (Block, [Lanes; 3 * SH_REST_MAX], Sums);
 
     #[inline(always)]
     fn run<S: Simd>(self, s: S) -> Self::Output {
         let (mut out, mut bands) = (Block::ZERO, [Lanes([0.0; LANES]); 3 * SH_REST_MAX]);
-        let Some((gradient, sum)) = self.pass.block::<S, true>(s, self.index, (self.block, self.rest)) else {
-            return (out, bands, 0.0);
+        let block = (self.block, self.rest);
+        let Some((gradient, sums)) = self.pass.block::<S, true, false>(s, self.index, block) else {
+            return (out, bands, Sums::default());
         };
         for (to, row) in out.0.iter_mut().zip(gradient.rows) {
             s.store(s.keep(gradient.lanes, row), &mut to.0);
@@ -327,6 +445,6 @@ impl Kernel for GradientBlock<'_> {
                 s.store(s.keep(gradient.lanes, s.mul(basis[row / 3], color)), &mut to.0);
             }
         }
-        (out, bands, sum)
+        (out, bands, sums)
     }
 }

@@ -2,7 +2,9 @@
 
 use glam::{DMat2, DMat3, DVec2, DVec3, DVec4};
 
-use super::{PARAMETERS, Parameters, PixelGradient, Projection, Splat, anisotropy, blend, image_loss, render, splats};
+use super::{
+    PARAMETERS, Parameters, PixelGradient, Projection, Splat, anisotropy, blend, image_loss, logistic, render, splats,
+};
 use crate::model::{ROW_LOG_SCALE, ROW_MEAN, ROW_OPACITY, ROW_ROTATION, ROW_SH, sh_rest_coefficients};
 use crate::projection::ALPHA_MAX;
 use crate::settings::TrainingSettings;
@@ -65,6 +67,14 @@ pub fn gradient(parameters: &[Parameters], view: &TrainingView, settings: &Train
         let weight = f64::from(settings.isotropic_weight) / (3 * parameters.len()) as f64;
         for (to, slope) in out[index][ROW_LOG_SCALE..].iter_mut().zip(anisotropy(&parameters[index]).1) {
             *to += weight * slope;
+        }
+    }
+    let per = |weight: f32, each: usize| f64::from(weight) / (each * parameters.len().max(1)) as f64;
+    for (out, parameters) in out.iter_mut().zip(parameters) {
+        let opacity = logistic(parameters[ROW_OPACITY]);
+        out[ROW_OPACITY] += per(settings.opacity_weight, 1) * opacity * (1.0 - opacity);
+        for k in ROW_LOG_SCALE..ROW_LOG_SCALE + 3 {
+            out[k] += per(settings.scale_weight, 3) * parameters[k].exp();
         }
     }
     out

@@ -4,7 +4,7 @@
 
 use std::arch::x86_64::*;
 
-use super::{Kernel, Simd, append_hits_one_by_one, build};
+use super::{Kernel, Simd, build};
 
 /// Proof that the machine has AVX2 and FMA: only [`Avx2::detect`] makes one.
 #[derive(Clone, Copy)]
@@ -304,15 +304,5 @@ impl Simd for Avx2 {
                 (_mm256_set_m128(groups[1][s], groups[0][s]), _mm256_set_m128(_mm_setzero_ps(), groups[2][s]))
             })
         })
-    }
-    #[inline(always)]
-    fn append_hits<const N: usize>(
-        self,
-        hits: &[u32; 16],
-        first: u16,
-        lists: &mut [[u16; N]; 16],
-        counts: &mut [usize; 16],
-    ) {
-        append_hits_one_by_one(hits, first, lists, counts);
     }
 }

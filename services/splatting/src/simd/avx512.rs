@@ -250,24 +250,14 @@ impl Simd for Avx512 {
         })
     }
     #[inline(always)]
-    fn append_hits<const N: usize>(
-        self,
-        hits: &[u32; 16],
-        first: u16,
-        lists: &mut [[u16; N]; 16],
-        counts: &mut [usize; 16],
-    ) {
+    fn append(self, mask: __mmask16, first: u16, to: &mut [u16]) -> usize {
+        let to = &mut to[..16];
         with_avx512!({
-            let hits = _mm512_loadu_epi32(hits.as_ptr().cast());
             let counting = _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
             let numbers = _mm512_add_epi32(_mm512_set1_epi32(i32::from(first)), counting);
-            for (bit, (list, count)) in lists.iter_mut().zip(counts).enumerate() {
-                let mask = _mm512_test_epi32_mask(hits, _mm512_set1_epi32(1 << bit));
-                let packed = _mm512_cvtepi32_epi16(_mm512_maskz_compress_epi32(mask, numbers));
-                let to = &mut list[*count..*count + 16];
-                _mm256_storeu_si256(to.as_mut_ptr().cast(), packed);
-                *count += mask.count_ones() as usize;
-            }
-        })
+            let packed = _mm512_cvtepi32_epi16(_mm512_maskz_compress_epi32(mask, numbers));
+            _mm256_storeu_si256(to.as_mut_ptr().cast(), packed);
+        });
+        mask.count_ones() as usize
     }
 }

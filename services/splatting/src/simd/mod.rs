@@ -189,15 +189,19 @@ pub(crate) trait Simd: Copy {
         build!(x[0]; 4; |s| self.load(&build!(0.0; 16; |lane| from[lane / 4][lane % 4 * 4 + s])))
     }
 
-    /// Appends to list `b`, for each lane i with bit b of `hits[i]` set, the number `first + i`; counts follow. Up to 16
-    /// numbers after the new end of each list may be overwritten.
-    fn append_hits<const N: usize>(
-        self,
-        hits: &[u32; 16],
-        first: u16,
-        lists: &mut [[u16; N]; 16],
-        counts: &mut [usize; 16],
-    );
+    /// Writes, for each lane i of the mask, the number `first + i` to the beginning of `to`, and says how many there
+    /// were. All sixteen numbers of `to` may be overwritten.
+    #[inline(always)]
+    fn append(self, mask: Self::M, first: u16, to: &mut [u16]) -> usize {
+        let mut bits = self.bits(mask);
+        let mut count = 0;
+        while bits != 0 {
+            to[count] = first + bits.trailing_zeros() as u16;
+            bits &= bits - 1;
+            count += 1;
+        }
+        count
+    }
 
     /// 2^x with a degree-4 polynomial (relative error 4e-6), for alphas.
     #[inline(always)]
@@ -232,25 +236,6 @@ pub(crate) trait Simd: Copy {
         let s2 = self.mul(s, s);
         let p = polynomial(self, &[1.0 / 9.0, 1.0 / 7.0, 1.0 / 5.0, 1.0 / 3.0, 1.0], s2);
         self.fma(self.mul(s, p), self.splat(2.0 * std::f32::consts::LOG2_E), e)
-    }
-}
-
-/// [`Simd::append_hits`] bit by bit.
-#[inline(always)]
-fn append_hits_one_by_one<const N: usize>(
-    hits: &[u32; 16],
-    first: u16,
-    lists: &mut [[u16; N]; 16],
-    counts: &mut [usize; 16],
-) {
-    for (i, &hits) in hits.iter().enumerate() {
-        let mut hits = hits & 0xffff;
-        while hits != 0 {
-            let list = hits.trailing_zeros() as usize;
-            hits &= hits - 1;
-            lists[list][counts[list]] = first + i as u16;
-            counts[list] += 1;
-        }
     }
 }
 
@@ -347,21 +332,16 @@ mod tests {
         }
     }
 
-    /// Appending gives what appending one by one gives.
+    /// Appending writes the numbers of the lanes of a mask, in order.
     #[inline(always)]
     fn check_append<S: Simd>(s: S) {
-        let (mut lists, mut counts) = ([[0_u16; 64]; 16], [0_usize; 16]);
-        let (mut expected, mut expected_counts) = (lists, counts);
-        for step in 0..2_u32 {
-            let hits: [u32; 16] = std::array::from_fn(|i| (i as u32 * 0x9e37 + step * 0x1234) & 0xffff);
-            s.append_hits(&hits, 16 * step as u16, &mut lists, &mut counts);
-            append_hits_one_by_one(&hits, 16 * step as u16, &mut expected, &mut expected_counts);
+        for bits in [0_u16, 1, 0x8000, 0xffff, 0x9e37, 0x4210] {
+            let mut to = [7_u16; 40];
+            let count = s.append(s.mask(bits), 32, &mut to[5..]);
+            let expected: Vec<u16> = (0..16).filter(|i| bits >> i & 1 == 1).map(|i| 32 + i).collect();
+            assert_eq!(to[5..5 + count], expected);
+            assert!(to[..5].iter().chain(&to[21..]).all(|&v| v == 7));
         }
-        assert_eq!(counts, expected_counts);
-        for ((list, expected), count) in lists.iter().zip(&expected).zip(counts) {
-            assert_eq!(list[..count], expected[..count]);
-        }
-        assert!(counts.iter().sum::<usize>() > 50);
     }
 
     fn expected(x: [f32; 16]) -> Vec<[f32; 16]> {

@@ -4,7 +4,7 @@
 
 use std::arch::aarch64::*;
 
-use super::{Simd, append_hits_one_by_one, build};
+use super::{Simd, build};
 
 /// The instruction set is part of the target, so there is nothing to detect.
 #[derive(Clone, Copy)]
@@ -254,15 +254,5 @@ impl Simd for Neon {
         let zero = with_neon!(vdupq_n_f32(0.0));
         let columns = build!(x[0]; 3; |m| transpose_4(x[m]));
         build!(x[0]; 4; |s| [columns[0][s], columns[1][s], columns[2][s], zero])
-    }
-    #[inline(always)]
-    fn append_hits<const N: usize>(
-        self,
-        hits: &[u32; 16],
-        first: u16,
-        lists: &mut [[u16; N]; 16],
-        counts: &mut [usize; 16],
-    ) {
-        append_hits_one_by_one(hits, first, lists, counts);
     }
 }

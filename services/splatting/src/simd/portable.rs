@@ -1,7 +1,7 @@
 //! Plain Rust, for machines without AVX2 and as a second opinion in tests. No `mul_add`, `floor` or `round`: without
 //! the instructions they are library calls.
 
-use super::{Simd, append_hits_one_by_one};
+use super::Simd;
 
 #[derive(Clone, Copy)]
 pub(super) struct Portable;
@@ -151,15 +151,5 @@ impl Simd for Portable {
     #[inline(always)]
     fn transpose(self, rows: &mut [F16; 16]) {
         *rows = std::array::from_fn(|i| std::array::from_fn(|j| rows[j][i]));
-    }
-    #[inline(always)]
-    fn append_hits<const N: usize>(
-        self,
-        hits: &[u32; 16],
-        first: u16,
-        lists: &mut [[u16; N]; 16],
-        counts: &mut [usize; 16],
-    ) {
-        append_hits_one_by_one(hits, first, lists, counts);
     }
 }

@@ -1,11 +1,13 @@
 //! Gradients of every parameter class: the reference's against central differences of its loss, and the engine's against
 //! the reference's.
 
+use glam::Vec3;
+
 use super::harmonics::scene_of_degree;
 use super::{camera, isas, random_view, scene};
 use crate::model::sh_rest_rows;
 use crate::reference::{self, Parameters};
-use crate::{Camera, Engine, Gaussians, RenderSettings, TrainingSettings, TrainingView};
+use crate::{Camera, Engine, Gaussian, Gaussians, Optimiser, RenderSettings, TrainingSettings, TrainingView};
 
 /// Parameters of a class, as indices into [`Parameters`].
 type Class = (&'static str, std::ops::Range<usize>);
@@ -77,6 +79,8 @@ fn only(term: usize, settings: TrainingSettings) -> TrainingSettings {
         depth_weight: weight(2),
         free_weight: weight(3),
         isotropic_weight: weight(4),
+        opacity_weight: weight(5),
+        scale_weight: weight(6),
         ..settings
     }
 }
@@ -119,6 +123,8 @@ fn of_each_term_of_the_reference_are_those_of_central_differences() {
         check_reference(&only(term, smooth(3)), 3, 61, &GEOMETRY);
     }
     check_reference(&only(4, smooth(3)), 3, 62, &GEOMETRY[1..2]);
+    check_reference(&only(5, smooth(3)), 3, 62, &GEOMETRY[3..4]);
+    check_reference(&only(6, smooth(3)), 3, 62, &GEOMETRY[1..2]);
 }
 
 /// Compares the engine with the reference on every instruction set.
@@ -179,6 +185,46 @@ fn of_each_term_of_the_engine_are_those_of_the_reference() {
         check(&scene(60, 23), camera(35, 27), &only(term, settings), &GEOMETRY);
     }
     check(&scene(60, 23), camera(35, 27), &only(4, settings), &GEOMETRY[1..2]);
+    check(&scene(60, 23), camera(35, 27), &only(5, settings), &GEOMETRY[3..4]);
+    check(&scene(60, 23), camera(35, 27), &only(6, settings), &GEOMETRY[1..2]);
+}
+
+#[test]
+fn of_the_whole_loss_with_the_regularisers_of_mcmc() {
+    let settings = TrainingSettings { opacity_weight: 2.0, scale_weight: 3.0, ..TrainingSettings::default() };
+    check(&scene_of_degree(60, 29, 2), camera(35, 27), &settings, &classes(2));
+}
+
+/// The regularisers reach every Gaussian, also one that the view does not show, and no broken one.
+#[test]
+fn of_the_regularisers_of_mcmc_where_a_gaussian_is_out_of_sight_or_broken() {
+    let settings = TrainingSettings { scale_weight: 3.0, ..only(5, TrainingSettings::default()) };
+    let mut model = scene_of_degree(37, 23, 1);
+    model.set(20, &Gaussian { mean: Vec3::splat(50.0), ..model.get(20) });
+    let view = random_view(camera(35, 27), 5);
+    let want = reference::gradient(&reference::parameters(&model), &view, &settings);
+    model.push(&Gaussian { opacity_logit: f32::NAN, ..model.get(0) });
+    model.push(&Gaussian { log_scales: Vec3::splat(500.0), ..model.get(0) });
+    for isa in isas() {
+        let mut engine = Engine::with_isa(1, isa).unwrap();
+        let got = engine_gradient(&mut engine, &model, &view, &settings);
+        for (i, (got, want)) in got.iter().zip(&want).enumerate() {
+            for (k, (got, want)) in got.iter().zip(want).enumerate() {
+                // Two Gaussians more in the mean.
+                let want = want * 37.0 / 39.0;
+                assert!((got - want).abs() <= 1e-5 * want.abs() + 1e-9, "{isa:?} {i} {k}: {got} instead of {want}");
+            }
+        }
+        assert!(got[20][10] > 0.0 && got[20][3] > 0.0);
+        assert!(got[37..].iter().flatten().all(|g| *g == 0.0));
+        let (mut optimiser, mut moved) = (Optimiser::new(), model.clone());
+        let terms = engine.train_step(&mut moved, &mut optimiser, &view, &settings);
+        let opacity: f64 = model.iter().take(37).map(|g| f64::from(g.opacity())).sum();
+        assert!((terms.opacity - opacity / 39.0).abs() < 1e-6 && terms.scale_m > 0.0);
+        assert!((0..39).all(|i| optimiser.steps(i) == u32::from(i < 37)));
+        assert!(moved.get(20).opacity_logit < model.get(20).opacity_logit && moved.get(20).mean == model.get(20).mean);
+        assert!((0..37).all(|i| moved.sh_rest(i) == model.sh_rest(i)), "the loss has nothing of colour");
+    }
 }
 
 #[test]

@@ -1,10 +1,13 @@
 //! The engine against the reference, and against itself on other instruction sets and thread counts.
 
+mod densify;
+mod densify_training;
 mod edges;
 mod forward;
 mod gradients;
 mod harmonics;
 mod hostile;
+mod statistics;
 mod training;
 
 use glam::{Quat, Vec3};
