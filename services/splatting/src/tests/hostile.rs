@@ -69,14 +69,18 @@ fn any_camera() -> impl Strategy<Value = Camera> {
 
 fn settings() -> impl Strategy<Value = TrainingSettings> {
     let limits = prop::option::of(Just((0.01, 0.5)));
-    (any::<bool>(), prop::sample::select(vec![0.0, 0.1, 0.3]), 0..=3_u8, 0.0..5.0_f32, limits, any::<bool>()).prop_map(
-        |(opacity_compensation, low_pass_px2, sh_degree, isotropic_weight, sigma_limits_m, fast)| {
+    let low_pass = prop::sample::select(vec![0.0, 0.1, 0.3]);
+    let regularisers = (0.0..5.0_f32, prop::sample::select(vec![0.0, 0.01, 1.0]));
+    (any::<bool>(), low_pass, 0..=3_u8, regularisers, limits, any::<bool>()).prop_map(
+        |(opacity_compensation, low_pass_px2, sh_degree, (isotropic_weight, of_all), sigma_limits_m, fast)| {
             let render = RenderSettings { opacity_compensation, low_pass_px2, sh_degree, ..RenderSettings::default() };
             let rate = if fast { 10.0 } else { 1.0 };
             let usual = TrainingSettings::default();
             TrainingSettings {
                 render,
                 isotropic_weight,
+                opacity_weight: of_all,
+                scale_weight: of_all,
                 sigma_limits_m,
                 lr_means: 1e-2 * rate,
                 lr_opacity: usual.lr_opacity * rate,
