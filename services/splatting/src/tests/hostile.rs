@@ -1,5 +1,7 @@
 //! Models that no training would make: nothing panics, and nothing that is finite becomes infinite or NaN.
 
+use std::sync::atomic::AtomicBool;
+
 use glam::{Quat, Vec3};
 use proptest::prelude::*;
 use proptest::test_runner::RngSeed;
@@ -141,6 +143,10 @@ proptest! {
             prop_assert!(rendered.alpha.iter().all(|a| (-1e-6..=1.0).contains(a)));
             engine.moments(&model, &camera, &settings.render, 2.0, &mut moments);
             prop_assert!(moments.alpha.iter().chain(&moments.first).chain(&moments.second).all(|v| v.is_finite()));
+            let views = [MomentsView { camera, reference_m: 2.0 }];
+            let never = AtomicBool::new(false);
+            let visit = |_, batched: &Moments| assert!(*batched == moments, "{isa:?}: a batch differs from its view");
+            engine.moments_batch(&model, &views, &settings.render, &never, visit).unwrap();
         }
     }
 
@@ -160,7 +166,7 @@ proptest! {
         prop_assert_eq!(rendered.alpha.len(), camera.pixels());
         prop_assert!(rendered.color.iter().flatten().chain(&rendered.alpha).chain(&rendered.depth).all(|v| v.is_finite()));
         let views = [MomentsView { camera, reference_m: numbers[0] }];
-        let never = std::sync::atomic::AtomicBool::new(false);
+        let never = AtomicBool::new(false);
         engine.moments_batch(&model, &views, &settings, &never, |_, _| {}).unwrap();
     }
 }
