@@ -217,6 +217,7 @@ impl Engine {
         reference_m: f32,
         out: &mut Moments,
     ) {
+        let settings = &without_bands(settings);
         self.frame.prepare(self.isa, &self.workers, gaussians.into(), camera, settings);
         let target = Target { camera, settings, channels: Channels::Moments { reference_m } };
         blend_frame(self.isa, &self.workers, &self.blend_scratch, &mut self.frame, &target, None);
@@ -237,6 +238,7 @@ impl Engine {
         cancel: &AtomicBool,
         visit: impl Fn(usize, &Moments) + Sync,
     ) -> Result<(), EngineError> {
+        let settings = &without_bands(settings);
         let cancelled = AtomicBool::new(false);
         let alone = Workers::sequential();
         let isa = self.isa;
@@ -265,6 +267,11 @@ impl Engine {
         let target = Target { camera, settings, channels: Channels::Color };
         blend_frame(self.isa, &self.workers, &self.blend_scratch, &mut self.frame, &target, saved);
     }
+}
+
+/// Moments of depth have no colour that could depend on the direction.
+fn without_bands(settings: &RenderSettings) -> RenderSettings {
+    RenderSettings { sh_degree: 0, ..*settings }
 }
 
 /// What a frame is blended into.

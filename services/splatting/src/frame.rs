@@ -200,7 +200,7 @@ impl Frame {
 
         self.first_slots.resize(chunks * (CHUNK + 1), 0);
         let view = View::new(camera, settings);
-        let sh_rows = if model.shapes.is_some() { 0 } else { gaussians.active_sh_rows(settings.sh_degree) };
+        let sh_rows = gaussians.active_sh_rows(settings.sh_degree);
         let valid = camera.is_valid();
         let rows = Shared::new(&mut self.rows);
         let visible = Shared::new(&mut self.visible);

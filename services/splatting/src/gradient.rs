@@ -41,10 +41,12 @@ pub(crate) struct Screen<S: Simd> {
 impl<S: Simd> BlockGradient<S> {
     /// No lane has a gradient.
     #[inline(always)]
-    pub(crate) fn zero(s: S) -> Self {
+    pub(crate) fn zero<const BANDS: bool>(s: S) -> Self {
         let (zero, none) = (s.splat(0.0), s.mask(0));
+        // Zeros, not nothing: what the bands do must not depend on whether a neighbour in the block is drawn.
+        let bands = if BANDS { Some([zero; SH_REST_MAX]) } else { None };
         let screen = Screen { gradient: [zero; 2], covariance: [zero; 3], visible: none, moved: none };
-        Self { rows: [zero; ROWS], bands: None, lanes: none, scales: [zero; 3], screen }
+        Self { rows: [zero; ROWS], bands, lanes: none, scales: [zero; 3], screen }
     }
 }
 

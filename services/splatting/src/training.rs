@@ -325,7 +325,7 @@ impl<'a> ParameterPass<'a> {
         if self.opacity != 0.0 || self.scale != 0.0 {
             let mut all = match gradient {
                 Some(gradient) => gradient,
-                None => BlockGradient::zero(s),
+                None => BlockGradient::zero::<BANDS>(s),
             };
             self.regularise(s, index, block.0, &mut all, &mut sums);
             return Some((all, sums));

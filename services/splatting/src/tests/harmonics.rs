@@ -74,3 +74,26 @@ fn bands_above_the_evaluated_degree_stay_and_the_others_move_by_their_learning_r
         }
     }
 }
+
+#[test]
+fn what_a_gaussian_out_of_sight_does_not_depend_on_its_neighbours_in_memory() {
+    let view = random_view(camera(50, 40), 4);
+    // With this weight every Gaussian takes steps, drawn or not.
+    let settings = TrainingSettings { opacity_weight: 0.01, ..TrainingSettings::default() };
+    let trained = |place: usize| {
+        let mut model = scene_of_degree(17, 3, 1);
+        let mut order: Vec<u32> = (0..17).collect();
+        order.swap(place, 16);
+        model.permute(&order);
+        let (mut engine, mut optimiser) = (Engine::new(1).unwrap(), Optimiser::new());
+        engine.train_step(&mut model, &mut optimiser, &view, &settings);
+        let before = model.sh_rest(place);
+        model.set(place, &Gaussian { mean: Vec3::new(30.0, 0.0, 0.0), ..model.get(place) });
+        engine.train_step(&mut model, &mut optimiser, &view, &settings);
+        assert_eq!(optimiser.steps(place), 2);
+        (before, model.sh_rest(place))
+    };
+    let (alone, among_others) = (trained(16), trained(3));
+    assert_eq!(alone, among_others);
+    assert_ne!(alone.0, alone.1, "its moments move it on");
+}

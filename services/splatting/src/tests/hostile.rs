@@ -1,5 +1,7 @@
 //! Models that no training would make: nothing panics, and nothing that is finite becomes infinite or NaN.
 
+use std::sync::atomic::AtomicBool;
+
 use glam::{Quat, Vec3};
 use proptest::prelude::*;
 use proptest::test_runner::RngSeed;
@@ -69,14 +71,18 @@ fn any_camera() -> impl Strategy<Value = Camera> {
 
 fn settings() -> impl Strategy<Value = TrainingSettings> {
     let limits = prop::option::of(Just((0.01, 0.5)));
-    (any::<bool>(), prop::sample::select(vec![0.0, 0.1, 0.3]), 0..=3_u8, 0.0..5.0_f32, limits, any::<bool>()).prop_map(
-        |(opacity_compensation, low_pass_px2, sh_degree, isotropic_weight, sigma_limits_m, fast)| {
+    let low_pass = prop::sample::select(vec![0.0, 0.1, 0.3]);
+    let regularisers = (0.0..5.0_f32, prop::sample::select(vec![0.0, 0.01, 1.0]));
+    (any::<bool>(), low_pass, 0..=3_u8, regularisers, limits, any::<bool>()).prop_map(
+        |(opacity_compensation, low_pass_px2, sh_degree, (isotropic_weight, of_all), sigma_limits_m, fast)| {
             let render = RenderSettings { opacity_compensation, low_pass_px2, sh_degree, ..RenderSettings::default() };
             let rate = if fast { 10.0 } else { 1.0 };
             let usual = TrainingSettings::default();
             TrainingSettings {
                 render,
                 isotropic_weight,
+                opacity_weight: of_all,
+                scale_weight: of_all,
                 sigma_limits_m,
                 lr_means: 1e-2 * rate,
                 lr_opacity: usual.lr_opacity * rate,
@@ -137,6 +143,10 @@ proptest! {
             prop_assert!(rendered.alpha.iter().all(|a| (-1e-6..=1.0).contains(a)));
             engine.moments(&model, &camera, &settings.render, 2.0, &mut moments);
             prop_assert!(moments.alpha.iter().chain(&moments.first).chain(&moments.second).all(|v| v.is_finite()));
+            let views = [MomentsView { camera, reference_m: 2.0 }];
+            let never = AtomicBool::new(false);
+            let visit = |_, batched: &Moments| assert!(*batched == moments, "{isa:?}: a batch differs from its view");
+            engine.moments_batch(&model, &views, &settings.render, &never, visit).unwrap();
         }
     }
 
@@ -156,7 +166,7 @@ proptest! {
         prop_assert_eq!(rendered.alpha.len(), camera.pixels());
         prop_assert!(rendered.color.iter().flatten().chain(&rendered.alpha).chain(&rendered.depth).all(|v| v.is_finite()));
         let views = [MomentsView { camera, reference_m: numbers[0] }];
-        let never = std::sync::atomic::AtomicBool::new(false);
+        let never = AtomicBool::new(false);
         engine.moments_batch(&model, &views, &settings, &never, |_, _| {}).unwrap();
     }
 }
