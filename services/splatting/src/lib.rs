@@ -23,6 +23,7 @@ mod neighbours;
 mod optimiser;
 pub mod ply;
 mod projection;
+mod random;
 pub mod reference;
 mod schedule;
 mod settings;
