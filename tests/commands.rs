@@ -88,6 +88,27 @@ fn folders_without_a_mission_and_broken_models_are_named() {
 }
 
 #[test]
+fn a_model_file_is_exported_in_another_format_and_a_broken_one_named() {
+    let folder = tempfile::tempdir().expect("folder");
+    let model = splatting::Gaussians::new();
+    let source = folder.path().join("rock.ply");
+    let mut file = fs::File::create(&source).expect("made");
+    splatting::ply::write(&model, &mut file).expect("written");
+    let (status, said) = run(&["export", text(&source), "--format", "spz"]);
+    let out = folder.path().join("rock.spz");
+    assert_eq!((status, said), (Some(0), format!("{}: 0 Gaussians\n", text(&out))));
+    assert_eq!(splatting::formats::spz::read(&fs::read(&out).expect("there")).expect("an SPZ"), model);
+    refused(&["export", text(&source), "--format", "colmap"], 64, &["rock.ply", "mission folder"]);
+    refused(&["export", text(&source), "--format", "ply"], 64, &["rock.ply", "--output"]);
+    refused(&["export", text(&source), "--format", "glb"], 1, &["rock.glb", "0 Gaussians"]);
+    fs::write(&out, b"NGSP").expect("written");
+    refused(&["export", text(&out), "--format", "ply"], 1, &["rock.spz", "version"]);
+    let notes = folder.path().join("notes.txt");
+    fs::write(&notes, "ply").expect("written");
+    refused(&["export", text(&notes), "--format", "glb"], 64, &["notes.txt", ".glb"]);
+}
+
+#[test]
 fn every_command_has_help_with_an_example_and_the_configuration_is_printed_whole() {
     for command in [
         "fly",

@@ -35,9 +35,13 @@ pub enum Command {
     /// Measure a mission's model against held-out views and the true surface.
     #[command(after_help = "Example: vantage evaluate missions/20260801-120000-0 --json")]
     Evaluate(Evaluate),
-    /// Write a mission's model or views for other people's tools.
-    #[command(after_help = "Example: vantage export missions/20260801-120000-0 --format colmap --output colmap")]
+    /// Write a mission's model or views for other people's tools, or a model file in another format.
+    #[command(after_help = "Example: vantage export missions/20260801-120000-0 --format glb --output statue.glb")]
     Export(Export),
+    /// Train a model offline on a mission folder, a COLMAP or a nerfstudio dataset.
+    #[command(after_help = "Example: vantage reconstruct missions/20260801-120000-0 --iterations 30000\n\
+        A run that was cut off goes on when its command is given again.")]
+    Reconstruct(Reconstruct),
     /// Print a configuration file with every key, its default and what it means.
     #[command(after_help = "Example: vantage config --preset quick > mission.toml")]
     Config(Configure),
@@ -181,8 +185,8 @@ pub struct Evaluate {
     /// Width of the held-out views, pixels; default: model.width. Another than the default is only printed.
     #[arg(long, value_name = "PIXELS")]
     pub width: Option<u32>,
-    /// Model to measure instead of the mission's own (INRIA PLY).
-    #[arg(long, value_name = "PLY")]
+    /// Model to measure instead of the mission's own (.ply, .splat, .spz or .glb).
+    #[arg(long, value_name = "FILE")]
     pub model: Option<PathBuf>,
     /// Print metrics.json instead of a table.
     #[arg(long)]
@@ -192,12 +196,13 @@ pub struct Evaluate {
 /// Arguments of `export`.
 #[derive(Debug, Clone, Args)]
 pub struct Export {
-    /// The mission folder.
-    pub folder: PathBuf,
+    /// The mission folder; or a model file (.ply, .splat, .spz or .glb) to write in another format.
+    #[arg(value_name = "DIR|FILE")]
+    pub source: PathBuf,
     /// What to write.
     #[arg(long, value_enum)]
     pub format: Format,
-    /// Where to; default: <folder>/export/<format>.
+    /// Where to; default: in DIR/export, or beside FILE.
     #[arg(long, value_name = "PATH")]
     pub output: Option<PathBuf>,
 }
@@ -205,12 +210,116 @@ pub struct Export {
 /// Formats of other people's tools.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub enum Format {
-    /// The model as an INRIA PLY, which every splat viewer reads.
+    /// The model as an INRIA PLY, which every splat viewer reads and which keeps everything.
     Ply,
+    /// The model as antimatter15's .splat, for web viewers; no view-dependent colours.
+    Splat,
+    /// The model as SPZ version 3, about six times smaller than PLY.
+    Spz,
+    /// The model as binary glTF with KHR_gaussian_splatting.
+    Glb,
     /// The views as a COLMAP text model.
     Colmap,
     /// The views as a nerfstudio transforms.json.
     Nerfstudio,
+}
+
+/// Arguments of `reconstruct`.
+#[derive(Debug, Clone, Args)]
+pub struct Reconstruct {
+    /// The dataset: a mission folder, a folder with COLMAP's sparse/0 and images, or one with transforms.json.
+    pub folder: PathBuf,
+    /// Training iterations.
+    #[arg(long, default_value_t = 7_000, value_name = "N")]
+    pub iterations: u32,
+    /// Where results go; default: <folder>/reconstruct.
+    #[arg(long, value_name = "DIR")]
+    pub out: Option<PathBuf>,
+    /// Replace what lies in the output folder.
+    #[arg(long)]
+    pub overwrite: bool,
+    /// How Gaussians are added and removed; default: none for a mission, whose depth seeds them, else default (3DGS).
+    #[arg(long, value_enum)]
+    pub strategy: Option<Strategy>,
+    /// Most Gaussians.
+    #[arg(long, default_value_t = 1_000_000, value_name = "N")]
+    pub max_gaussians: usize,
+    /// Highest degree of spherical harmonics, 0 to 3.
+    #[arg(long, default_value_t = 3, value_name = "N")]
+    pub sh_degree: u8,
+    /// Seed of everything random.
+    #[arg(long, default_value_t = 0, value_name = "N")]
+    pub seed: u64,
+    /// Threads; 0: one per core. The result is the same for any number.
+    #[arg(long, default_value_t = 0, value_name = "N")]
+    pub threads: usize,
+    /// Iterations between two evaluations on the held-out images, besides 7000, 30000 and the last; 0: those only.
+    #[arg(long, default_value_t = 1_000, value_name = "N")]
+    pub eval_every: u32,
+    /// Every how many-th image is held out, by name; 0: none.
+    #[arg(long, default_value_t = 8, value_name = "N")]
+    pub hold_out: usize,
+    /// Colour behind the model; default: grey for a mission, else black.
+    #[arg(long, value_enum)]
+    pub background: Option<Background>,
+    /// What pixels outside of masks and alpha channels are.
+    #[arg(long, value_enum, default_value_t = Mask::Auto)]
+    pub mask: Mask,
+    /// Whole number by which images are shrunk; default: a mission's training size, else until none is wider than 1600.
+    #[arg(long, value_name = "N")]
+    pub downscale: Option<u32>,
+    /// Folder of a COLMAP dataset's images, such as images_2; cameras are scaled to it. Default: images.
+    #[arg(long, value_name = "NAME")]
+    pub images: Option<String>,
+    /// Megabytes that images may take; default: half of what is free.
+    #[arg(long, value_name = "MB")]
+    pub memory: Option<u64>,
+    /// Longest time between two checkpoints, milliseconds.
+    #[arg(long, default_value_t = 10_000, value_name = "MS", hide = true)]
+    pub checkpoint_ms: u64,
+    /// Show no progress.
+    #[arg(long, short)]
+    pub quiet: bool,
+    /// Print metrics.json instead of a table.
+    #[arg(long)]
+    pub json: bool,
+}
+
+/// How the number of Gaussians changes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum Strategy {
+    /// Clone, split and prune by gradients on the screen, as 3DGS.
+    Default,
+    /// Relocate, and grow to the most, as 3DGS-MCMC.
+    Mcmc,
+    /// Keep what training began with, less what is pruned.
+    None,
+}
+
+/// Colours behind a model.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum Background {
+    /// Black.
+    Black,
+    /// White.
+    White,
+    /// Half grey.
+    Grey,
+    /// Another colour in each iteration; black in evaluation.
+    Random,
+}
+
+/// Uses of masks.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum Mask {
+    /// Unknown outside of a mask file, empty where an alpha channel is transparent.
+    Auto,
+    /// Unknown: no part of the loss.
+    Ignore,
+    /// Empty: the model must be transparent there.
+    Empty,
+    /// Unused: every pixel counts, also of a mission.
+    Off,
 }
 
 /// Arguments of `config`.

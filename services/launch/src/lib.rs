@@ -4,6 +4,7 @@
 //! - [`service`]: one process of a mission in the foreground;
 //! - [`fly`], [`supervise`], [`progress`], [`summary`]: a whole mission;
 //! - [`evaluate`], [`export`]: what a mission folder is worth, and how it leaves Vantage;
+//! - [`reconstruct`]: offline training on a mission folder or another dataset;
 //! - [`status`], [`doctor`]: what runs, and whether this machine is fit for it.
 
 #![forbid(unsafe_code)]
@@ -19,6 +20,7 @@ pub mod instance;
 pub mod machine_check;
 pub mod proc;
 pub mod progress;
+pub mod reconstruct;
 pub mod service;
 pub mod settings;
 pub mod status;
@@ -69,34 +71,52 @@ fn run(command: &Command) -> anyhow::Result<Exit> {
         Command::Status(arguments) => status::run(arguments),
         Command::Doctor(arguments) => doctor::run(arguments),
         Command::Evaluate(arguments) => evaluate::run(arguments),
-        Command::Export(arguments) => export_mission(arguments),
+        Command::Export(arguments) => export_any(arguments),
+        Command::Reconstruct(arguments) => reconstruct::run(arguments),
         Command::Config(arguments) => {
             print(&shared_types::config::commented(&settings::resolve(&arguments.settings)?)?)
         }
     }
 }
 
-fn export_mission(arguments: &cli::Export) -> anyhow::Result<Exit> {
-    let folder = MissionFolder::open(&arguments.folder)?;
+fn export_any(arguments: &cli::Export) -> anyhow::Result<Exit> {
+    use splatting::formats::Format as Model;
     let (format, name) = match arguments.format {
-        cli::Format::Ply => (export::Format::Ply, "model.ply"),
+        cli::Format::Ply => (export::Format::Model(Model::Ply), "model.ply"),
+        cli::Format::Splat => (export::Format::Model(Model::Splat), "model.splat"),
+        cli::Format::Spz => (export::Format::Model(Model::Spz), "model.spz"),
+        cli::Format::Glb => (export::Format::Model(Model::Glb), "model.glb"),
         cli::Format::Colmap => (export::Format::Colmap, "colmap"),
         cli::Format::Nerfstudio => (export::Format::Nerfstudio, "nerfstudio"),
     };
-    let out = arguments.output.clone().unwrap_or_else(|| folder.root().join("export").join(name));
-    if let Some(parent) = out.parent() {
-        std::fs::create_dir_all(parent)?;
-    }
-    if format == export::Format::Ply {
-        // A damaged model is refused here and not in the reader's tool.
-        evaluate::read_model(&folder.model_path().join("model.ply"))?;
-    }
-    let summary = export::export(&folder, format, &out).map_err(|error| match error {
+    let source = &arguments.source;
+    let (exported, out) = if source.is_file() {
+        let export::Format::Model(model) = format else {
+            let message = format!("{}: {name} has views, expected a mission folder and not a file", source.display());
+            return Err(exit::Refusal::usage(message));
+        };
+        let out = arguments.output.clone().unwrap_or_else(|| source.with_extension(model.extension()));
+        (export::export_model(source, model, &out), out)
+    } else {
+        let folder = MissionFolder::open(source)?;
+        let out = arguments.output.clone().unwrap_or_else(|| folder.root().join("export").join(name));
+        if let Some(parent) = out.parent() {
+            std::fs::create_dir_all(parent)?;
+        }
+        (export::export(&folder, format, &out), out)
+    };
+    let summary = exported.map_err(|error| match error {
         export::ExportError::Folder(error) => error.into(),
+        usage @ (export::ExportError::NotAModel { .. } | export::ExportError::Itself { .. }) => {
+            exit::Refusal::usage(usage.to_string())
+        }
         other => exit::Refusal::failed(other.to_string()),
     })?;
+    if let Some(degree) = summary.lost_sh_degree {
+        say(&format!("vantage: {name} has no view-dependent colours: those of SH degree {degree} were left out"));
+    }
     match summary.views {
-        0 => print(&format!("{}\n", out.display())),
+        0 => print(&format!("{}: {} Gaussians\n", out.display(), summary.gaussians)),
         views => print(&format!("{}: {views} views, {} points\n", out.display(), summary.points)),
     }
 }

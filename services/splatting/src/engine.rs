@@ -10,10 +10,11 @@ use thiserror::Error;
 use crate::backward;
 use crate::blend::{self, BlendTile, Channels, Contributors};
 use crate::camera::{Camera, RenderSettings};
-use crate::frame::{Frame, LAST, TILE};
+use crate::frame::{self, Frame, LAST, TILE};
 use crate::loss::LossImages;
 use crate::model::Gaussians;
 use crate::optimiser::Corrections;
+use crate::projection::ShapeBlock;
 use crate::simd::{Isa, dispatch};
 use crate::ssim;
 use crate::workers::{PerWorker, Shared, Workers};
@@ -118,6 +119,7 @@ pub struct Engine {
     pub(crate) places: Vec<u32>,
     pub(crate) corrections: Corrections,
     singles: PerWorker<Single>,
+    shapes: Vec<ShapeBlock>,
     pub(crate) stage_times: [Duration; 7],
 }
 
@@ -148,6 +150,7 @@ impl Engine {
             places: Vec::new(),
             corrections: Corrections::default(),
             singles: PerWorker::new(&workers),
+            shapes: Vec::new(),
             stage_times: [Duration::ZERO; 7],
             workers,
         })
@@ -185,7 +188,7 @@ impl Engine {
     /// Renders colour, alpha and expected depth. Broken Gaussians (not finite, absurdly large) are left out; a camera
     /// that cannot project sees nothing.
     pub fn render(&mut self, gaussians: &Gaussians, camera: &Camera, settings: &RenderSettings, out: &mut Rendered) {
-        self.frame.prepare(self.isa, &self.workers, gaussians, camera, settings);
+        self.frame.prepare(self.isa, &self.workers, gaussians.into(), camera, settings);
         self.blend(camera, settings, false);
         let pixels = camera.pixels();
         (out.width, out.height) = (camera.width, camera.height);
@@ -214,7 +217,7 @@ impl Engine {
         reference_m: f32,
         out: &mut Moments,
     ) {
-        self.frame.prepare(self.isa, &self.workers, gaussians, camera, settings);
+        self.frame.prepare(self.isa, &self.workers, gaussians.into(), camera, settings);
         let target = Target { camera, settings, channels: Channels::Moments { reference_m } };
         blend_frame(self.isa, &self.workers, &self.blend_scratch, &mut self.frame, &target, None);
         copy_moments(&self.frame, camera, reference_m, out);
@@ -237,6 +240,8 @@ impl Engine {
         let cancelled = AtomicBool::new(false);
         let alone = Workers::sequential();
         let isa = self.isa;
+        frame::keep_shapes(isa, &self.workers, gaussians, &mut self.shapes);
+        let model = frame::Model { gaussians, shapes: Some(&self.shapes) };
         self.workers.run(views.len(), |worker, index| {
             if cancel.load(Ordering::Relaxed) {
                 cancelled.store(true, Ordering::Relaxed);
@@ -244,7 +249,7 @@ impl Engine {
             }
             let MomentsView { camera, reference_m } = views[index];
             self.singles.with(worker, |single| {
-                single.frame.prepare(isa, &alone, gaussians, &camera, settings);
+                single.frame.prepare(isa, &alone, model, &camera, settings);
                 let target = Target { camera: &camera, settings, channels: Channels::Moments { reference_m } };
                 blend_frame(isa, &alone, &single.scratch, &mut single.frame, &target, None);
                 copy_moments(&single.frame, &camera, reference_m, &mut single.moments);

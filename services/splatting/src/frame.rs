@@ -7,8 +7,8 @@
 #![expect(unsafe_code, reason = "tasks write disjoint parts of shared buffers")]
 
 use crate::camera::{Camera, RenderSettings};
-use crate::model::{Gaussians, LANES, Lanes};
-use crate::projection::{View, project};
+use crate::model::{Block, Gaussians, LANES, Lanes};
+use crate::projection::{Shape, ShapeBlock, View, project};
 use crate::sh;
 use crate::simd::{Isa, Kernel, Simd, build, dispatch};
 use crate::sort::{Item, sort_by_key};
@@ -80,6 +80,49 @@ impl Footprint {
     }
 }
 
+/// What is drawn.
+#[derive(Clone, Copy)]
+pub(crate) struct Model<'a> {
+    pub gaussians: &'a Gaussians,
+    /// What does not depend on the view, where many views are drawn without colours.
+    pub shapes: Option<&'a [ShapeBlock]>,
+}
+
+impl<'a> From<&'a Gaussians> for Model<'a> {
+    fn from(gaussians: &'a Gaussians) -> Self {
+        Self { gaussians, shapes: None }
+    }
+}
+
+/// The part of a projection that all views share, for [`Model::shapes`].
+pub(crate) fn keep_shapes(isa: Isa, workers: &Workers, gaussians: &Gaussians, out: &mut Vec<ShapeBlock>) {
+    let blocks = gaussians.blocks();
+    out.resize(blocks.len(), [Lanes([0.0; LANES]); 13]);
+    let shapes = Shared::new(out);
+    workers.run(blocks.len().div_ceil(CHUNK_BLOCKS), |_, chunk| {
+        let range = chunk * CHUNK_BLOCKS..blocks.len().min((chunk + 1) * CHUNK_BLOCKS);
+        // SAFETY: the ranges of different chunks do not overlap.
+        let shapes = unsafe { shapes.slice_mut(range.clone()) };
+        dispatch(isa, KeepShapes { blocks: &blocks[range], shapes });
+    });
+}
+
+struct KeepShapes<'a> {
+    blocks: &'a [Block],
+    shapes: &'a mut [ShapeBlock],
+}
+
+impl Kernel for KeepShapes<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<S: Simd>(self, s: S) {
+        for (block, kept) in self.blocks.iter().zip(self.shapes) {
+            Shape::new(s, block).keep(s, kept);
+        }
+    }
+}
+
 #[derive(Clone, Copy, Default)]
 struct Chunk {
     items: usize,
@@ -125,11 +168,11 @@ impl Frame {
         &mut self,
         isa: Isa,
         workers: &Workers,
-        gaussians: &Gaussians,
+        model: Model<'_>,
         camera: &Camera,
         settings: &RenderSettings,
     ) {
-        self.project(isa, workers, gaussians, camera, settings);
+        self.project(isa, workers, model, camera, settings);
         self.sort(workers);
         self.bin(workers);
     }
@@ -139,10 +182,11 @@ impl Frame {
         &mut self,
         isa: Isa,
         workers: &Workers,
-        gaussians: &Gaussians,
+        model: Model<'_>,
         camera: &Camera,
         settings: &RenderSettings,
     ) {
+        let gaussians = model.gaussians;
         self.tiles_x = (camera.width as usize).div_ceil(TILE);
         self.tiles_y = (camera.height as usize).div_ceil(TILE);
         self.pixels.resize(self.tiles(), [Plane::ZERO; 5]);
@@ -156,7 +200,7 @@ impl Frame {
 
         self.first_slots.resize(chunks * (CHUNK + 1), 0);
         let view = View::new(camera, settings);
-        let sh_rows = gaussians.active_sh_rows(settings.sh_degree);
+        let sh_rows = if model.shapes.is_some() { 0 } else { gaussians.active_sh_rows(settings.sh_degree) };
         let valid = camera.is_valid();
         let rows = Shared::new(&mut self.rows);
         let visible = Shared::new(&mut self.visible);
@@ -176,8 +220,7 @@ impl Frame {
                 )
             };
             let count = if valid { gaussians.len() } else { 0 };
-            let kernel =
-                ProjectChunk { view: &view, gaussians, sh_rows, first, count, rows, visible, items, first_slots };
+            let kernel = ProjectChunk { view: &view, model, sh_rows, first, count, rows, visible, items, first_slots };
             let result = dispatch(isa, kernel);
             // SAFETY: one task per chunk.
             unsafe { results.write(chunk, result) };
@@ -330,7 +373,7 @@ impl Frame {
 
 struct ProjectChunk<'a> {
     view: &'a View,
-    gaussians: &'a Gaussians,
+    model: Model<'a>,
     /// Rows of the higher bands that are evaluated.
     sh_rows: usize,
     /// First block.
@@ -360,10 +403,14 @@ impl Kernel for ProjectChunk<'_> {
         let mut chunk = Chunk { items: 0, slots: 0, key_min: u32::MAX, key_max: 0 };
         for (i, visible) in self.visible.iter_mut().enumerate() {
             let block = self.first + i;
-            let parameters = &self.gaussians.blocks()[block];
-            let mut p = project(s, self.view, parameters, block_lanes(block, self.count));
+            let parameters = &self.model.gaussians.blocks()[block];
+            let shape = match self.model.shapes {
+                Some(shapes) => Shape::load(s, &shapes[block]),
+                None => Shape::new(s, parameters),
+            };
+            let mut p = project(s, self.view, &shape, block_lanes(block, self.count));
             if self.sh_rows != 0 && s.bits(p.visible) != 0 {
-                let rest = &self.gaussians.rest_rows(block)[..self.sh_rows];
+                let rest = &self.model.gaussians.rest_rows(block)[..self.sh_rows];
                 sh::add_bands(s, self.view, parameters, rest, &mut p);
             }
             let bits = s.bits(p.visible);

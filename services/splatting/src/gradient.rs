@@ -6,7 +6,7 @@ use crate::frame::Frame;
 use crate::model::{
     Block, LANES, Lanes, ROW_LOG_SCALE, ROW_MEAN, ROW_OPACITY, ROW_ROTATION, ROW_SH, ROWS, SH_C0, SH_REST_MAX,
 };
-use crate::projection::{Projected, View, project};
+use crate::projection::{Projected, Shape, View, project};
 use crate::sh;
 use crate::simd::{Simd, build};
 
@@ -110,8 +110,9 @@ pub(crate) fn block_gradient<S: Simd, const BANDS: bool, const OBSERVED: bool>(
     }
     s.transpose(&mut rows);
     let moments = build!(zero; MOMENTS; |i| rows[i]);
-    let projected = project(s, view, block, visible);
-    let (mut rows, d_mean) = parameter_gradients(s, view, &projected, &moments);
+    let shape = Shape::new(s, block);
+    let projected = project(s, view, &shape, visible);
+    let (mut rows, d_mean) = parameter_gradients(s, view, &shape, &projected, &moments);
     let mut bands = None;
     if BANDS {
         let d_color = [moments[6], moments[7], moments[8]];
@@ -126,7 +127,7 @@ pub(crate) fn block_gradient<S: Simd, const BANDS: bool, const OBSERVED: bool>(
     let [a, b, c] = projected.raw;
     let covariance = [s.add(a, low_pass), b, s.add(c, low_pass)];
     let screen = Screen { gradient: d_mean, covariance, visible: s.mask(visible), moved: lanes };
-    Some(BlockGradient { rows, bands, lanes, scales: projected.scales, screen })
+    Some(BlockGradient { rows, bands, lanes, scales: shape.scales, screen })
 }
 
 /// Chain rule from the ten moments to the fourteen parameters, and to the mean's position in pixels.
@@ -134,6 +135,7 @@ pub(crate) fn block_gradient<S: Simd, const BANDS: bool, const OBSERVED: bool>(
 fn parameter_gradients<S: Simd>(
     s: S,
     view: &View,
+    shape: &Shape<S>,
     p: &Projected<S>,
     moments: &[S::F; MOMENTS],
 ) -> ([S::F; ROWS], [S::F; 2]) {
@@ -200,16 +202,16 @@ fn parameter_gradients<S: Simd>(
         let d_column = [d_m[0][k], d_m[1][k], d_m[2][k]];
         out[ROW_LOG_SCALE + k] = dot(s, &d_column, &[p.m[0][k], p.m[1][k], p.m[2][k]]);
         for (j, d_row) in d_rot.iter_mut().enumerate() {
-            d_row[k] = s.mul(p.scales[k], dot(s, &columns[j], &d_column));
+            d_row[k] = s.mul(shape.scales[k], dot(s, &columns[j], &d_column));
         }
     }
-    let d_quat = quaternion_gradient(s, &p.quat, &d_rot);
+    let d_quat = quaternion_gradient(s, &shape.quat, &d_rot);
     let mut along = zero;
     for i in 0..4 {
-        along = s.fma(p.quat[i], d_quat[i], along);
+        along = s.fma(shape.quat[i], d_quat[i], along);
     }
     for i in 0..4 {
-        out[ROW_ROTATION + i] = s.mul(p.inv_quat_length, s.fnma(p.quat[i], along, d_quat[i]));
+        out[ROW_ROTATION + i] = s.mul(shape.inv_quat_length, s.fnma(shape.quat[i], along, d_quat[i]));
     }
     out[ROW_OPACITY] = d_logit;
     for (k, d_color) in [red, green, blue].into_iter().enumerate() {

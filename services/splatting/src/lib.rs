@@ -9,10 +9,12 @@
 
 mod backward;
 mod blend;
+pub mod bytes;
 mod camera;
 pub mod checkpoint;
 mod densify;
 mod engine;
+pub mod formats;
 mod frame;
 mod gradient;
 mod initial;
@@ -21,10 +23,11 @@ pub mod metrics;
 mod model;
 mod neighbours;
 mod optimiser;
-pub mod ply;
+pub mod order;
 mod projection;
 mod random;
 pub mod reference;
+pub mod rgbd;
 mod schedule;
 mod settings;
 mod sh;
@@ -43,6 +46,7 @@ pub use densify::{
     DefaultSettings, Densifier, DensifierState, DensifyError, DensifyReport, McmcSettings, Relocation, Strategy,
 };
 pub use engine::{DEPTH_ALPHA_TINY, Engine, EngineError, Moments, MomentsView, Rendered, Work};
+pub use formats::ply;
 pub use initial::{ColoredPoint, InitialError, InitialGaussians, random_points};
 pub use model::{Gaussian, Gaussians, SH_C0, SH_DEGREE_MAX, SH_REST_MAX, sh_rest_coefficients};
 pub use optimiser::Optimiser;

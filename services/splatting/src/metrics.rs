@@ -62,6 +62,26 @@ pub fn ssim(a: &[[f32; 3]], b: &[[f32; 3]], width: usize, height: usize, mask: O
     (count > 0).then(|| sum / count as f64)
 }
 
+/// SSIM over the pixels where `mask` is true, colours clamped as a screen does: as [`ssim`] of the clamped images, but only
+/// the part of the image that the pixels' windows reach is looked at. `None` where no pixel counts, or a size differs.
+pub fn masked_ssim(a: &[[f32; 3]], b: &[[f32; 3]], mask: &[bool], width: usize, height: usize) -> Option<f64> {
+    let reach = window().len() / 2;
+    if mask.len() != width * height || a.len() != mask.len() || b.len() != mask.len() {
+        return None;
+    }
+    let inside = || mask.iter().enumerate().filter(|(_, inside)| **inside).map(|(i, _)| (i % width, i / width));
+    let left = inside().map(|(x, _)| x).min()?.saturating_sub(reach);
+    let top = inside().map(|(_, y)| y).min()?.saturating_sub(reach);
+    let right = (inside().map(|(x, _)| x).max()? + reach + 1).min(width);
+    let bottom = (inside().map(|(_, y)| y).max()? + reach + 1).min(height);
+    let rows = |row: usize| row * width + left..row * width + right;
+    let crop = |image: &[[f32; 3]]| -> Vec<[f32; 3]> {
+        (top..bottom).flat_map(|row| &image[rows(row)]).map(|color| color.map(|value| value.clamp(0.0, 1.0))).collect()
+    };
+    let part: Vec<bool> = (top..bottom).flat_map(|row| &mask[rows(row)]).copied().collect();
+    ssim(&crop(a), &crop(b), right - left, bottom - top, Some(&part))
+}
+
 pub(crate) fn blur(values: &[f64], width: usize, height: usize) -> Vec<f64> {
     let window = window().map(f64::from);
     let radius = window.len() / 2;
@@ -109,5 +129,21 @@ mod tests {
         let similarity = ssim(&image, &noisy, 20, 15, None).unwrap();
         assert!(similarity < 0.95 && similarity > 0.0, "{similarity}");
         assert_eq!(ssim(&image, &noisy, 21, 15, None), None);
+    }
+
+    fn pattern(width: usize, height: usize, shift: usize) -> Vec<[f32; 3]> {
+        (0..width * height).map(|i| [((i + shift) % 7) as f32 / 7.0, (i % 5) as f32 / 5.0, 0.4]).collect()
+    }
+
+    #[test]
+    fn cropping_to_the_objects_windows_does_not_change_its_ssim() {
+        let (width, height) = (40, 30);
+        let (a, b) = (pattern(width, height, 0), pattern(width, height, 1));
+        let mask: Vec<bool> =
+            (0..width * height).map(|i| (12..20).contains(&(i % width)) && (10..15).contains(&(i / width))).collect();
+        let whole = ssim(&a, &b, width, height, Some(&mask)).expect("ssim");
+        let cropped = masked_ssim(&a, &b, &mask, width, height).expect("ssim");
+        assert!((whole - cropped).abs() < 1e-12, "{whole} {cropped}");
+        assert_eq!(masked_ssim(&a, &b, &vec![false; mask.len()], width, height), None);
     }
 }

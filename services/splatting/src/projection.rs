@@ -7,7 +7,7 @@
 use glam::{Mat3, Vec3};
 
 use crate::camera::{Camera, RenderSettings};
-use crate::model::{Block, ROW_LOG_SCALE, ROW_MEAN, ROW_OPACITY, ROW_ROTATION, ROW_SH, SH_C0};
+use crate::model::{Block, Lanes, ROW_LOG_SCALE, ROW_MEAN, ROW_OPACITY, ROW_ROTATION, ROW_SH, SH_C0};
 use crate::simd::{Simd, build};
 
 /// Largest alpha of one splat. Clamped at projection, once per splat, instead of once per pixel.
@@ -93,10 +93,6 @@ pub(crate) struct Projected<S: Simd> {
     pub jy: S::F,
     pub free_x: S::M,
     pub free_y: S::M,
-    /// Unit quaternion (x, y, z, w) and one over the length of the stored one.
-    pub quat: [S::F; 4],
-    pub inv_quat_length: S::F,
-    pub scales: [S::F; 3],
     /// M, row-major: m[i][k].
     pub m: [[S::F; 3]; 3],
     /// Rows of U.
@@ -147,16 +143,98 @@ fn dot3<S: Simd>(s: S, a: &[S::F; 3], b: &[S::F; 3]) -> S::F {
     s.fma(a[0], b[0], s.fma(a[1], b[1], s.mul(a[2], b[2])))
 }
 
-/// Projects the 16 Gaussians of a block; lanes outside of `lanes` are not visible.
+/// What a projection needs of sixteen Gaussians, whatever the view.
+pub(crate) struct Shape<S: Simd> {
+    pub mean: [S::F; 3],
+    /// Rot diag(scales), row-major: the Gaussian's axes in the world, as long as its standard deviations.
+    pub axes: [[S::F; 3]; 3],
+    /// 0 where the parameters are broken: then nothing is drawn.
+    pub opacity: S::F,
+    /// Colour of degree 0.
+    pub color: [S::F; 3],
+    /// Unit quaternion (x, y, z, w) and one over the length of the stored one.
+    pub quat: [S::F; 4],
+    pub inv_quat_length: S::F,
+    pub scales: [S::F; 3],
+}
+
+impl<S: Simd> Shape<S> {
+    /// From parameters.
+    #[inline(always)]
+    pub(crate) fn new(s: S, block: &Block) -> Self {
+        let (one, zero) = (s.splat(1.0), s.splat(0.0));
+        let raw_quat = build!(zero; 4; |i| row(s, block, ROW_ROTATION + i));
+        let mut length2 = zero;
+        for c in raw_quat {
+            length2 = s.fma(c, c, length2);
+        }
+        let inv_quat_length = s.div(one, s.sqrt(length2));
+        let quat = build!(zero; 4; |i| s.mul(raw_quat[i], inv_quat_length));
+        let rot = rotation_matrix(s, &quat);
+        let scales = build!(zero; 3; |k| s.exp(row(s, block, ROW_LOG_SCALE + k)));
+        let color = build!(zero; 3; |k| s.fma(row(s, block, ROW_SH + k), s.splat(SH_C0), s.splat(0.5)));
+        // Finite parameters that would overflow on the way (a rotation of 1e38, say) are as broken as infinite ones.
+        let mut size = s.add(s.abs(row(s, block, ROW_OPACITY)), length2);
+        for k in 0..3 {
+            size = s.add(size, s.abs(row(s, block, ROW_LOG_SCALE + k)));
+        }
+        let mut whole = s.and(s.gt(s.splat(VALUE_MAX), size), s.gt(length2, s.splat(1.0 / VALUE_MAX)));
+        for k in 0..3 {
+            whole = s.and(whole, s.gt(s.splat(VALUE_MAX), s.abs(color[k])));
+        }
+        let opacity = s.div(one, s.add(one, s.exp(s.sub(zero, row(s, block, ROW_OPACITY)))));
+        Self {
+            mean: build!(zero; 3; |k| row(s, block, ROW_MEAN + k)),
+            axes: build!([zero; 3]; 3; |i| build!(zero; 3; |k| s.mul(rot[i][k], scales[k]))),
+            opacity: s.keep(whole, opacity),
+            color,
+            quat,
+            inv_quat_length,
+            scales,
+        }
+    }
+
+    /// From what [`Shape::keep`] kept. Enough for a projection, not for its gradient or for colours.
+    #[inline(always)]
+    pub(crate) fn load(s: S, kept: &ShapeBlock) -> Self {
+        let zero = s.splat(0.0);
+        Self {
+            mean: build!(zero; 3; |k| s.load(&kept[k].0)),
+            axes: build!([zero; 3]; 3; |i| build!(zero; 3; |k| s.load(&kept[3 + 3 * i + k].0))),
+            opacity: s.load(&kept[12].0),
+            color: [zero; 3],
+            quat: [zero; 4],
+            inv_quat_length: zero,
+            scales: [zero; 3],
+        }
+    }
+
+    /// Keeps it for many views.
+    #[inline(always)]
+    pub(crate) fn keep(&self, s: S, kept: &mut ShapeBlock) {
+        for i in 0..3 {
+            s.store(self.mean[i], &mut kept[i].0);
+            for k in 0..3 {
+                s.store(self.axes[i][k], &mut kept[3 + 3 * i + k].0);
+            }
+        }
+        s.store(self.opacity, &mut kept[12].0);
+    }
+}
+
+/// Mean, axes and opacity of 16 Gaussians, kept for many views.
+pub(crate) type ShapeBlock = [Lanes; 13];
+
+/// Projects 16 Gaussians; lanes outside of `lanes` are not visible.
 #[inline(always)]
-pub(crate) fn project<S: Simd>(s: S, view: &View, block: &Block, lanes: u16) -> Projected<S> {
+pub(crate) fn project<S: Simd>(s: S, view: &View, shape: &Shape<S>, lanes: u16) -> Projected<S> {
     let one = s.splat(1.0);
     let half = s.splat(0.5);
 
     let offset = [
-        s.sub(row(s, block, ROW_MEAN), s.splat(view.eye.x)),
-        s.sub(row(s, block, ROW_MEAN + 1), s.splat(view.eye.y)),
-        s.sub(row(s, block, ROW_MEAN + 2), s.splat(view.eye.z)),
+        s.sub(shape.mean[0], s.splat(view.eye.x)),
+        s.sub(shape.mean[1], s.splat(view.eye.y)),
+        s.sub(shape.mean[2], s.splat(view.eye.z)),
     ];
     let zero = s.splat(0.0);
     let rotation = build!([zero; 3]; 3; |i| build!(zero; 3; |k| s.splat(view.rotation[i][k])));
@@ -174,18 +252,8 @@ pub(crate) fn project<S: Simd>(s: S, view: &View, block: &Block, lanes: u16) -> 
     let jx = s.min(s.max(ratio_x, low_x), high_x);
     let jy = s.min(s.max(ratio_y, low_y), high_y);
 
-    let raw_quat = build!(zero; 4; |i| row(s, block, ROW_ROTATION + i));
-    let mut length2 = zero;
-    for c in raw_quat {
-        length2 = s.fma(c, c, length2);
-    }
-    let inv_quat_length = s.div(one, s.sqrt(length2));
-    let quat = build!(zero; 4; |i| s.mul(raw_quat[i], inv_quat_length));
-    let rot = rotation_matrix(s, &quat);
-    let scales = build!(zero; 3; |k| s.exp(row(s, block, ROW_LOG_SCALE + k)));
-    let m = build!([zero; 3]; 3; |i| build!(zero; 3; |k| {
-        s.mul(dot3(s, &rotation[i], &[rot[0][k], rot[1][k], rot[2][k]]), scales[k])
-    }));
+    let axes = &shape.axes;
+    let m = build!([zero; 3]; 3; |i| build!(zero; 3; |k| dot3(s, &rotation[i], &[axes[0][k], axes[1][k], axes[2][k]])));
 
     let (gain_x, gain_y) = (s.mul(inv_z, s.splat(view.fx)), s.mul(inv_z, s.splat(view.fy)));
     let u = [
@@ -208,7 +276,7 @@ pub(crate) fn project<S: Simd>(s: S, view: &View, block: &Block, lanes: u16) -> 
     let inv_det = s.div(one, s.select(sound, det, one));
     let conic = [s.mul(c, inv_det), s.sub(s.splat(0.0), s.mul(b, inv_det)), s.mul(a, inv_det)];
 
-    let opacity = s.div(one, s.add(one, s.exp(s.sub(s.splat(0.0), row(s, block, ROW_OPACITY)))));
+    let opacity = shape.opacity;
     let compensation = if view.compensation { s.sqrt(s.mul(raw_det, inv_det)) } else { one };
     let alpha = s.mul(opacity, compensation);
     let unclamped = s.gt(s.splat(ALPHA_MAX), alpha);
@@ -233,18 +301,8 @@ pub(crate) fn project<S: Simd>(s: S, view: &View, block: &Block, lanes: u16) -> 
         bounds[axis + 2] = s.min(last, s.sub(size[axis], one));
         touches = s.and(touches, s.gt(s.splat(VALUE_MAX), s.abs(mean[axis])));
     }
-    let color = build!(zero; 3; |k| s.fma(row(s, block, ROW_SH + k), s.splat(SH_C0), half));
-    for k in 0..3 {
-        touches = s.and(touches, s.gt(s.splat(VALUE_MAX), s.abs(color[k])));
-    }
-    // Finite parameters that would overflow on the way (a rotation of 1e38, say) are as broken as infinite ones.
-    let mut size = s.add(s.abs(row(s, block, ROW_OPACITY)), length2);
-    for k in 0..3 {
-        size = s.add(size, s.abs(row(s, block, ROW_LOG_SCALE + k)));
-    }
-    let whole = s.and(s.gt(s.splat(VALUE_MAX), size), s.gt(length2, s.splat(1.0 / VALUE_MAX)));
     let sane_depth = s.and(in_front, s.gt(s.splat(VALUE_MAX), z));
-    let visible = s.and(s.and(s.and(touches, whole), sane_depth), s.mask(lanes));
+    let visible = s.and(s.and(touches, sane_depth), s.mask(lanes));
 
     Projected {
         visible,
@@ -256,9 +314,6 @@ pub(crate) fn project<S: Simd>(s: S, view: &View, block: &Block, lanes: u16) -> 
         jy,
         free_x,
         free_y,
-        quat,
-        inv_quat_length,
-        scales,
         m,
         u,
         raw,
@@ -269,7 +324,7 @@ pub(crate) fn project<S: Simd>(s: S, view: &View, block: &Block, lanes: u16) -> 
         unclamped,
         log2_alpha,
         threshold,
-        color,
+        color: shape.color,
         bounds,
     }
 }

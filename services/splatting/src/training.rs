@@ -168,7 +168,7 @@ impl Engine {
     fn accumulate(&mut self, gaussians: &Gaussians, view: &TrainingView, settings: &TrainingSettings) -> LossTerms {
         let camera = view.camera();
         let start = Instant::now();
-        self.frame.project(self.isa, &self.workers, gaussians, camera, &settings.render);
+        self.frame.project(self.isa, &self.workers, gaussians.into(), camera, &settings.render);
         let projected = Instant::now();
         self.frame.sort(&self.workers);
         let sorted = Instant::now();

@@ -11,12 +11,12 @@ use std::path::{Path, PathBuf};
 use shared_types::folder::{FolderError, write_atomic};
 use splatting::{Gaussians, Optimiser};
 
-use crate::codec::{Reader, Truncated, Writer, checksum};
-use crate::logic::order::ViewOrder;
 use crate::logic::rounds::LossHistory;
-use crate::logic::voxels::VoxelGrid;
 use crate::round::{FinishedRound, RoundSpec};
 use crate::session::{ActiveRound, Progression, Session};
+use splatting::bytes::{Reader, Truncated, Writer, checksum};
+use splatting::order::ViewOrder;
+use splatting::rgbd::voxels::VoxelGrid;
 
 const MAGIC: u64 = u64::from_le_bytes(*b"VNTGCKPT");
 const VERSION: u32 = 1;

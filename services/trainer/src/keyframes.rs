@@ -8,11 +8,10 @@ use shared_types::config::trainer::LossMask;
 use shared_types::config::{ModelConfig, TrainerConfig};
 use shared_types::folder::{FolderError, Keyframe, MissionFolder};
 use shared_types::frames::{Intrinsics, Pose};
+use splatting::rgbd::clip_box::ClipBox;
+use splatting::rgbd::downsample::{self, DownsampleError, SmallImage};
+use splatting::rgbd::masks;
 use splatting::{Camera, TrainingView};
-
-use crate::logic::clip_box::ClipBox;
-use crate::logic::downsample::{self, DownsampleError, SmallImage};
-use crate::logic::masks;
 
 /// Where keyframes come from.
 pub trait KeyframeSource: Send {

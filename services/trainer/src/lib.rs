@@ -6,7 +6,6 @@
 #![forbid(unsafe_code)]
 
 pub mod checkpoint;
-pub mod codec;
 pub mod keyframes;
 pub mod logic;
 pub mod measure;

@@ -3,7 +3,7 @@
 use glam::DVec3;
 use shared_types::messages::RoundRequest;
 
-use crate::codec::{Reader, Truncated, Writer};
+use splatting::bytes::{Reader, Truncated, Writer};
 
 /// What is asked of a round. Two requests are the same round if and only if these are equal.
 #[derive(Debug, Clone, PartialEq)]

@@ -5,18 +5,19 @@
 
 use std::collections::{BTreeMap, VecDeque};
 
+use shared_types::config::trainer::BirthShape;
 use shared_types::config::{ModelConfig, TrainerConfig};
 use shared_types::messages::GaussianRow;
 use splatting::{Engine, Gaussian, Gaussians, Optimiser, TrainingSettings};
 
 use crate::keyframes::{self, KeyframeError, KeyframeSource, SmallKeyframe, View};
-use crate::logic::clip_box::ClipBox;
-use crate::logic::insertion;
-use crate::logic::order::ViewOrder;
-use crate::logic::prune::{self, DepthView, PruneRules};
 use crate::logic::rounds::{LossHistory, means_learning_rate, window_views};
-use crate::logic::voxels::{VoxelGrid, voxel_edge_m};
 use crate::round::{FinishedRound, Progress, RoundSpec, generation};
+use splatting::order::ViewOrder;
+use splatting::rgbd::clip_box::ClipBox;
+use splatting::rgbd::insertion::{self, InsertionRules};
+use splatting::rgbd::prune::{self, DepthView, PruneRules};
+use splatting::rgbd::voxels::{VoxelGrid, voxel_edge_m};
 
 /// Training images behind `psnr_train_db`.
 pub(crate) const PSNR_IMAGES: usize = 100;
@@ -191,7 +192,7 @@ impl Session {
             for (id, keyframe) in &fresh {
                 let first_id = self.progression.next_gaussian_id + born.len() as u64;
                 born.extend(insertion::insert(
-                    &self.config,
+                    &insertion_rules(&self.config),
                     &keyframe.camera,
                     &keyframe.image,
                     &clip,
@@ -417,6 +418,21 @@ impl Session {
 
     pub(crate) fn restore(&mut self, model: Gaussians, optimiser: Optimiser, progression: Progression) {
         (self.model, self.optimiser, self.progression) = (model, optimiser, progression);
+    }
+}
+
+fn insertion_rules(config: &TrainerConfig) -> InsertionRules {
+    InsertionRules {
+        shape: match config.birth_shape {
+            BirthShape::Disc => insertion::BirthShape::Disc,
+            BirthShape::Isotropic => insertion::BirthShape::Isotropic,
+        },
+        sigma_voxels: config.birth_sigma_voxels as f32,
+        thickness_voxels: config.birth_thickness_voxels as f32,
+        opacity: config.birth_opacity as f32,
+        max_incidence_rad: (config.max_incidence_deg as f32).to_radians(),
+        max_depth_jump: config.max_depth_jump as f32,
+        reseed_ratio: config.reseed_ratio as f32,
     }
 }
 

@@ -17,6 +17,9 @@ pub struct Metrics {
     pub mission: Mission,
     /// The model as it was when the last round ended.
     pub live: Live,
+    /// The model as trained offline on the same keyframes.
+    #[serde(default)]
+    pub offline: Offline,
     /// What was seen of the object.
     pub coverage: Coverage,
     /// How near the model is to the true surface.
@@ -103,6 +106,28 @@ optional_figures! {
         pub psnr_init_db: f64,
         /// Gaussians of the model.
         pub gaussians: usize,
+    }
+}
+
+optional_figures! {
+    /// `offline.*`: means over the held-out views that `live.*` is measured on.
+    pub struct Offline {
+        /// Training iterations.
+        pub iterations: u32,
+        /// Object mask, radius R, dB.
+        pub psnr_object_db: f64,
+        /// Object mask, radius 0.8 R, dB.
+        pub psnr_object_near_db: f64,
+        /// Whole image, radius R, dB.
+        pub psnr_frame_db: f64,
+        /// Object mask, radius R.
+        pub ssim_object: f64,
+        /// Keyframes trained on: all, or those that were not held out.
+        pub keyframes: usize,
+        /// Gaussians of the model.
+        pub gaussians: usize,
+        /// Wall time of training, seconds.
+        pub seconds: f64,
     }
 }
 
@@ -221,7 +246,15 @@ impl Metrics {
             score_ms_p95: percentile(&flight.score_ms, 0.95),
             iterations_per_s: journal.iterations.zip(journal.rounds_s).and_then(|(count, time)| rate(count, time)),
         };
-        Self { mission, live, coverage, geometry: Geometry::default(), timing, memory: flight.memory.clone() }
+        Self {
+            mission,
+            live,
+            offline: Offline::default(),
+            coverage,
+            geometry: Geometry::default(),
+            timing,
+            memory: flight.memory.clone(),
+        }
     }
 }
 
@@ -233,6 +266,16 @@ impl Live {
         self.psnr_frame_db = quality.frame_db;
         self.ssim_object = quality.ssim_object;
         self.psnr_null_db = quality.null_db;
+    }
+}
+
+impl Offline {
+    /// Takes the figures of the held-out views.
+    pub fn take(&mut self, quality: &Quality) {
+        self.psnr_object_db = quality.object_db;
+        self.psnr_object_near_db = quality.object_near_db;
+        self.psnr_frame_db = quality.frame_db;
+        self.ssim_object = quality.ssim_object;
     }
 }
 

@@ -17,6 +17,7 @@ use shared_types::config::{Config, Layer, load};
 use shared_types::folder::{FolderError, MissionFolder, write_atomic};
 use shared_types::frames::Pose;
 use splatting::Gaussians;
+use splatting::formats::Format;
 
 use crate::cli::Evaluate;
 use crate::exit::{Exit, Refusal};
@@ -135,14 +136,15 @@ fn keyframe_poses(folder: &MissionFolder) -> Result<Vec<Pose>, FolderError> {
 /// Reads a model.
 ///
 /// # Errors
-/// Exit 1 when there is none, or it is truncated or no INRIA PLY.
+/// Exit 1 when there is none, or it is truncated or no model of a known format.
 pub fn read_model(path: &Path) -> anyhow::Result<Gaussians> {
     let bytes = std::fs::read(path).map_err(|error| {
         let way_out = "expected the model of a finished mission; `vantage resume` finishes one that was cut off";
         Refusal::failed(format!("{}: {error}; {way_out}", path.display()))
     })?;
-    splatting::ply::read(&bytes).map_err(|error| {
-        Refusal::failed(format!("{}: {error}; expected a whole INRIA PLY, such as model/rounds/*.ply", path.display()))
+    let format = Format::of_path(path).unwrap_or(Format::Ply);
+    splatting::formats::read(format, &bytes).map_err(|error| {
+        Refusal::failed(format!("{}: {error}; expected a whole model, such as model/rounds/*.ply", path.display()))
     })
 }
 

@@ -1,15 +1,12 @@
 //! Appearance: the model against the truth on held-out views.
 
 use shared_types::frames::{Intrinsics, Pose};
-use splatting::metrics::{psnr, ssim};
+use splatting::metrics::{masked_ssim, psnr};
 use splatting::{Camera, Engine, Gaussians, RenderSettings, Rendered};
 use world::truth::HeldOutView;
 
 use super::Effort;
 use super::truth::{TrueImage, Truth, cores};
-
-/// SSIM's window reaches this many pixels beyond a pixel.
-const WINDOW_RADIUS: usize = 5;
 
 /// A held-out view with its truth.
 #[derive(Debug, Clone)]
@@ -134,30 +131,6 @@ fn mean_color(views: &[TrueView]) -> [f32; 3] {
     sum.map(|total| if count > 0.0 { (total / count) as f32 } else { 0.5 })
 }
 
-/// SSIM over the object's pixels. Only the part of the image that their windows reach is looked at, colours clamped as a
-/// screen does.
-fn masked_ssim(a: &[[f32; 3]], b: &[[f32; 3]], mask: &[bool], width: usize, height: usize) -> Option<f64> {
-    let inside =
-        || mask.iter().enumerate().filter(|(_, object)| **object).map(|(index, _)| (index % width, index / width));
-    let left = inside().map(|(x, _)| x).min()?.saturating_sub(WINDOW_RADIUS);
-    let top = inside().map(|(_, y)| y).min()?.saturating_sub(WINDOW_RADIUS);
-    let right = (inside().map(|(x, _)| x).max()? + WINDOW_RADIUS + 1).min(width);
-    let bottom = (inside().map(|(_, y)| y).max()? + WINDOW_RADIUS + 1).min(height);
-    let crop = |image: &[[f32; 3]]| -> Option<Vec<[f32; 3]>> {
-        let mut part = Vec::with_capacity((right - left) * (bottom - top));
-        for row in top..bottom {
-            let line = image.get(row * width + left..row * width + right)?;
-            part.extend(line.iter().map(|color| color.map(|value| value.clamp(0.0, 1.0))));
-        }
-        Some(part)
-    };
-    let mut part = Vec::with_capacity((right - left) * (bottom - top));
-    for row in top..bottom {
-        part.extend_from_slice(mask.get(row * width + left..row * width + right)?);
-    }
-    ssim(&crop(a)?, &crop(b)?, right - left, bottom - top, Some(&part))
-}
-
 /// Gives each core a part of the items and puts the results together in the items' order.
 fn in_parallel<T: Sync, R: Send>(
     items: &[T],
@@ -180,22 +153,6 @@ fn in_parallel<T: Sync, R: Send>(
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    fn pattern(width: usize, height: usize, shift: usize) -> Vec<[f32; 3]> {
-        (0..width * height).map(|i| [((i + shift) % 7) as f32 / 7.0, (i % 5) as f32 / 5.0, 0.4]).collect()
-    }
-
-    #[test]
-    fn cropping_to_the_objects_windows_does_not_change_its_ssim() {
-        let (width, height) = (40, 30);
-        let (a, b) = (pattern(width, height, 0), pattern(width, height, 1));
-        let mask: Vec<bool> =
-            (0..width * height).map(|i| (12..20).contains(&(i % width)) && (10..15).contains(&(i / width))).collect();
-        let whole = ssim(&a, &b, width, height, Some(&mask)).expect("ssim");
-        let cropped = masked_ssim(&a, &b, &mask, width, height).expect("ssim");
-        assert!((whole - cropped).abs() < 1e-12, "{whole} {cropped}");
-        assert_eq!(masked_ssim(&a, &b, &vec![false; mask.len()], width, height), None);
-    }
 
     #[test]
     fn parts_come_back_in_order() {

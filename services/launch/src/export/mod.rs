@@ -1,13 +1,15 @@
-//! A mission folder for other people's tools: COLMAP, nerfstudio, and the model as PLY.
+//! A mission folder for other people's tools: COLMAP, nerfstudio, and the model in every format of
+//! [`splatting::formats`].
 //!
-//! `export(&MissionFolder, Format, out: &Path) -> Result<Summary, ExportError>` does it all. `out` is a folder for COLMAP
-//! and nerfstudio, a file for PLY. Every file appears whole; the images are the keyframes' own files, copied.
+//! [`export`] does it for a mission, [`export_model`] for a model file of any of these formats. What is written is a folder
+//! for COLMAP and nerfstudio, a file for models. Every file appears whole; the images are the keyframes' own files, copied.
 
 use std::path::{Path, PathBuf};
 
 use glam::DVec3;
 use shared_types::folder::{FolderError, Keyframe, MissionFolder, write_atomic};
 use shared_types::frames::Intrinsics;
+use splatting::{RenderSettings, formats};
 
 pub mod colmap;
 pub mod nerfstudio;
@@ -22,8 +24,8 @@ pub enum Format {
     Colmap,
     /// `images/`, `depth/`, `points.ply` and `transforms.json`.
     Nerfstudio,
-    /// The final model, in the layout of the original 3D Gaussian Splatting code.
-    Ply,
+    /// The final model as one file.
+    Model(formats::Format),
 }
 
 /// What was written.
@@ -33,6 +35,10 @@ pub struct Summary {
     pub views: usize,
     /// Points exported.
     pub points: usize,
+    /// Gaussians exported.
+    pub gaussians: usize,
+    /// Degree of the model's spherical harmonics, where the format has none above 0 and they were lost.
+    pub lost_sh_degree: Option<u8>,
 }
 
 /// Why an export failed.
@@ -48,6 +54,36 @@ pub enum ExportError {
         path: PathBuf,
         /// The system's reason.
         source: std::io::Error,
+    },
+    /// A file is no whole model.
+    #[error("{path}: {source}")]
+    Damaged {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong with it.
+        source: formats::ReadError,
+    },
+    /// The model does not fit in the format.
+    #[error("cannot write {path}: {source}")]
+    Unfit {
+        /// The file that was to be written.
+        path: PathBuf,
+        /// What does not fit.
+        source: formats::WriteError,
+    },
+    /// A file whose name is that of no model.
+    #[error(
+        "{path} is no model file by its name: expected one that ends with .ply, .splat, .spz or .glb, or a mission folder"
+    )]
+    NotAModel {
+        /// The file.
+        path: PathBuf,
+    },
+    /// The export would replace what it is made from.
+    #[error("{path} is the model itself: give another file with --output, or another --format")]
+    Itself {
+        /// The file.
+        path: PathBuf,
     },
     /// There is nothing to export.
     #[error("{path} does not exist: {way_out}")]
@@ -73,14 +109,13 @@ pub struct Point {
 /// # Errors
 /// When the mission holds nothing of the kind, a file is damaged, or the result cannot be written.
 pub fn export(folder: &MissionFolder, format: Format, out: &Path) -> Result<Summary, ExportError> {
-    if format == Format::Ply {
+    if let Format::Model(format) = format {
         let path = folder.model_path().join("model.ply");
         if !path.is_file() {
             let way_out = "finish the mission first with `vantage resume`";
             return Err(ExportError::Missing { path, way_out });
         }
-        write_atomic(out, &read(&path)?)?;
-        return Ok(Summary::default());
+        return export_model(&path, format, out);
     }
     let mut views = Vec::new();
     let mut points = Vec::new();
@@ -102,9 +137,44 @@ pub fn export(folder: &MissionFolder, format: Format, out: &Path) -> Result<Summ
     match format {
         Format::Colmap => colmap::write(out, &views, &points)?,
         Format::Nerfstudio => nerfstudio::write(out, &views, &points)?,
-        Format::Ply => {}
+        Format::Model(_) => {}
     }
-    Ok(Summary { views: views.len(), points: points.len() })
+    Ok(Summary { views: views.len(), points: points.len(), ..Summary::default() })
+}
+
+/// Writes a model file in another format; in its own format it is copied, once it has been read as whole.
+///
+/// # Errors
+/// When the file is no whole model, the model does not fit in the format, or the result cannot be written.
+pub fn export_model(source: &Path, format: formats::Format, out: &Path) -> Result<Summary, ExportError> {
+    let from = formats::Format::of_path(source).ok_or_else(|| ExportError::NotAModel { path: source.to_owned() })?;
+    let same = |a: &Path, b: &Path| a.canonicalize().ok().is_some_and(|a| b.canonicalize().is_ok_and(|b| a == b));
+    if same(source, out) {
+        return Err(ExportError::Itself { path: source.to_owned() });
+    }
+    let bytes = read(source)?;
+    let model =
+        formats::read(from, &bytes).map_err(|error| ExportError::Damaged { path: source.to_owned(), source: error })?;
+    let lost = format == formats::Format::Splat && model.sh_degree() > 0;
+    let summary =
+        Summary { gaussians: model.len(), lost_sh_degree: lost.then_some(model.sh_degree()), ..Summary::default() };
+    if from == format {
+        write_atomic(out, &bytes)?;
+        return Ok(summary);
+    }
+    // Ours are trained so; of others' it is not known, and the original code does not.
+    let antialiased = is_ours(&bytes) && RenderSettings::default().opacity_compensation;
+    let mut written = Vec::new();
+    formats::write(format, &model, antialiased, &mut written)
+        .map_err(|error| ExportError::Unfit { path: out.to_owned(), source: error })?;
+    write_atomic(out, &written)?;
+    Ok(summary)
+}
+
+/// Whether a PLY's header says that Vantage wrote it.
+fn is_ours(bytes: &[u8]) -> bool {
+    const MARK: &[u8] = b"\ncomment Vantage";
+    bytes.starts_with(b"ply\n") && bytes[..bytes.len().min(200)].windows(MARK.len()).any(|window| window == MARK)
 }
 
 /// Points of a keyframe's depth in the world, on a regular grid of pixels.

@@ -2,10 +2,12 @@
 
 use std::fs;
 
-use glam::{DMat4, DQuat, DVec2, DVec3};
+use glam::{DMat4, DQuat, DVec2, DVec3, Quat, Vec3};
 use shared_types::folder::{Exposure, Frame, Gate};
 use shared_types::frames::look_at;
 use shared_types::messages::KeyframeReason;
+use splatting::formats::Format::{Glb, Ply, Splat, Spz};
+use splatting::{Gaussian, Gaussians};
 
 use super::*;
 
@@ -135,15 +137,113 @@ fn nerfstudio_projects_a_point_onto_the_same_pixel() {
     assert_eq!(ply.lines().skip_while(|line| *line != "end_header").count() - 1, summary.points);
 }
 
+/// Nine Gaussians of a degree.
+fn model(degree: u8) -> Gaussians {
+    let mut model = Gaussians::with_sh_degree(degree);
+    for i in 0..9_u8 {
+        let x = f32::from(i);
+        model.push(&Gaussian {
+            mean: Vec3::new(0.1 * x, -0.2 * x, 0.5),
+            log_scales: Vec3::new(-4.0, -3.0, -5.0 + 0.1 * x),
+            rotation: Quat::from_rotation_z(0.3 * x),
+            opacity_logit: 0.5 * x - 2.0,
+            sh: [0.1 * x, -0.1, 0.3],
+            id: u64::from(i),
+            birth_round: 0,
+        });
+        let bands = std::array::from_fn(|k| [0.01 * k as f32, 0.02 * x, -0.1]);
+        model.set_sh_rest(usize::from(i), &bands);
+    }
+    model
+}
+
+fn bytes(format: formats::Format, model: &Gaussians) -> Vec<u8> {
+    let mut bytes = Vec::new();
+    formats::write(format, model, true, &mut bytes).expect("written");
+    bytes
+}
+
 #[test]
-fn a_model_is_copied_and_what_is_missing_is_named() {
+fn a_model_is_exported_in_every_format_and_what_is_missing_is_named() {
     let (dir, folder, _) = mission();
     let out = dir.path().join("out.ply");
-    let message = export(&folder, Format::Ply, &out).expect_err("no model").to_string();
+    let message = export(&folder, Format::Model(Ply), &out).expect_err("no model").to_string();
     assert!(message.contains("model.ply") && message.contains("vantage resume"), "{message}");
-    fs::write(folder.model_path().join("model.ply"), b"ply\n").expect("write");
-    export(&folder, Format::Ply, &out).expect("copied");
-    assert_eq!(fs::read(&out).expect("read"), b"ply\n");
+    let source = folder.model_path().join("model.ply");
+    fs::write(&source, bytes(Ply, &model(0))).expect("write");
+    for format in formats::Format::ALL {
+        let out = dir.path().join(format!("out.{}", format.extension()));
+        let summary = export(&folder, Format::Model(format), &out).expect("exported");
+        assert_eq!((summary.gaussians, summary.views, summary.lost_sh_degree), (9, 0, None));
+        assert_eq!(fs::read(&out).expect("read"), bytes(format, &model(0)), "{format:?}");
+    }
+    let message = export(&folder, Format::Model(Ply), &source).expect_err("itself").to_string();
+    assert!(message.contains("model.ply") && message.contains("--output"), "{message}");
+    assert_eq!(fs::read(&source).expect("kept"), bytes(Ply, &model(0)));
+    let whole = fs::read(&source).expect("read");
+    fs::write(&source, &whole[..whole.len() - 1]).expect("write");
+    let message = export(&folder, Format::Model(Ply), &out).expect_err("truncated").to_string();
+    assert!(message.contains("model.ply") && message.contains("truncated"), "{message}");
     let empty = MissionFolder::create(dir.path().join("empty")).expect("folder");
     assert!(matches!(export(&empty, Format::Colmap, &out), Err(ExportError::Missing { .. })));
+}
+
+#[test]
+fn a_model_file_is_written_in_any_other_format() {
+    let dir = tempfile::tempdir().expect("tempdir");
+    for from in formats::Format::ALL {
+        let source = dir.path().join(format!("source.{}", from.extension()));
+        fs::write(&source, bytes(from, &model(2))).expect("write");
+        for to in formats::Format::ALL {
+            let out = dir.path().join("new folder").join(format!("out.{}", to.extension()));
+            let summary = export_model(&source, to, &out).expect("exported");
+            let back = formats::read(to, &fs::read(&out).expect("read")).expect("a model");
+            let lost = from == Splat || to == Splat;
+            assert_eq!((back.len(), back.sh_degree()), (9, if lost { 0 } else { 2 }), "{from:?} {to:?}");
+            let expected = (to == Splat && from != Splat).then_some(2);
+            assert_eq!((summary.gaussians, summary.lost_sh_degree), (9, expected), "{from:?} {to:?}");
+            for g in model(2).iter() {
+                let nearest = back.iter().map(|b| (b.mean - g.mean).length()).fold(f32::INFINITY, f32::min);
+                assert!(nearest < 1e-3, "{from:?} {to:?}: {nearest} m");
+            }
+        }
+    }
+}
+
+#[test]
+fn only_our_models_are_marked_as_antialiased() {
+    let dir = tempfile::tempdir().expect("tempdir");
+    let (source, out) = (dir.path().join("m.ply"), dir.path().join("m.spz"));
+    let ours = bytes(Ply, &model(0));
+    let at = ours.windows(7).position(|window| window == b"Vantage").expect("comment");
+    let mut foreign = ours.clone();
+    foreign[at..at + 7].copy_from_slice(b"Another");
+    for (file, antialiased) in [(ours, true), (foreign, false)] {
+        fs::write(&source, file).expect("write");
+        export_model(&source, Spz, &out).expect("exported");
+        let mut expected = Vec::new();
+        formats::write(Spz, &model(0), antialiased, &mut expected).expect("written");
+        assert_eq!(fs::read(&out).expect("read"), expected);
+    }
+}
+
+#[test]
+fn files_that_are_no_models_are_named() {
+    let dir = tempfile::tempdir().expect("tempdir");
+    let out = dir.path().join("out.glb");
+    let text = dir.path().join("notes.txt");
+    fs::write(&text, "ply\n").expect("write");
+    let message = export_model(&text, Glb, &out).expect_err("no model").to_string();
+    assert!(message.contains("notes.txt") && message.contains(".splat"), "{message}");
+    for format in formats::Format::ALL {
+        let broken = dir.path().join(format!("broken.{}", format.extension()));
+        fs::write(&broken, b"this is no model").expect("write");
+        let message = export_model(&broken, Glb, &out).expect_err("no model").to_string();
+        assert!(message.contains("broken."), "{message}");
+    }
+    let empty = dir.path().join("empty.ply");
+    fs::write(&empty, bytes(Ply, &Gaussians::new())).expect("write");
+    let message = export_model(&empty, Glb, &out).expect_err("nothing").to_string();
+    assert!(message.contains("out.glb") && message.contains("0 Gaussians"), "{message}");
+    assert!(!out.exists());
 }

@@ -1,10 +1,4 @@
-//! The trainer's logic: no IPC, no clock, no files; time, seeds and images come in as arguments.
+//! The trainer's logic: no IPC, no clock, no files; time, seeds and images come in as arguments. What offline training does
+//! too (pixel classes, insertion, pruning) is in `splatting::rgbd`.
 
-pub mod clip_box;
-pub mod downsample;
-pub mod insertion;
-pub mod masks;
-pub mod order;
-pub mod prune;
 pub mod rounds;
-pub mod voxels;

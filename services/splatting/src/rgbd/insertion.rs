@@ -5,13 +5,54 @@
 //! first seen at a grazing angle; here such a voxel is seeded again once a pixel sees it twice as finely.
 
 use glam::{Quat, Vec3};
-use shared_types::config::TrainerConfig;
-use shared_types::config::trainer::BirthShape;
-use splatting::{Camera, Gaussian};
 
 use super::clip_box::ClipBox;
 use super::downsample::SmallImage;
 use super::voxels::VoxelGrid;
+use crate::{Camera, Gaussian};
+
+/// Shape of a Gaussian at birth (A29).
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum BirthShape {
+    /// A disc across the normal that the depth image shows.
+    Disc,
+    /// A sphere, as in the paper.
+    Isotropic,
+}
+
+/// Which points are inserted, and as what (A29).
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct InsertionRules {
+    /// Shape at birth.
+    pub shape: BirthShape,
+    /// Standard deviation across the surface, voxel edges (also the sphere's).
+    pub sigma_voxels: f32,
+    /// Standard deviation along the normal, voxel edges (disc only).
+    pub thickness_voxels: f32,
+    /// Opacity at birth.
+    pub opacity: f32,
+    /// Points seen at a greater angle to their normal are not inserted, radians.
+    pub max_incidence_rad: f32,
+    /// Points next to a depth jump greater than this share of their depth are not inserted.
+    pub max_depth_jump: f32,
+    /// A voxel seeded from more than this many times the present footprint is seeded again.
+    pub reseed_ratio: f32,
+}
+
+impl Default for InsertionRules {
+    /// The values of live flight.
+    fn default() -> Self {
+        Self {
+            shape: BirthShape::Disc,
+            sigma_voxels: 0.6,
+            thickness_voxels: 0.15,
+            opacity: 0.8,
+            max_incidence_rad: 75f32.to_radians(),
+            max_depth_jump: 0.05,
+            reseed_ratio: 2.0,
+        }
+    }
+}
 
 /// A depth point that may be inserted: position and normal in the world (towards the camera), and the size of its pixel
 /// on the surface, metres.
@@ -77,7 +118,7 @@ pub fn surface_points(
 /// Inserts what an image shows and the grid lacks. Ids count up from `first_id`; `round` is the round of birth.
 #[must_use]
 pub fn insert(
-    config: &TrainerConfig,
+    rules: &InsertionRules,
     camera: &Camera,
     image: &SmallImage,
     clip: &ClipBox,
@@ -86,28 +127,22 @@ pub fn insert(
     round: u32,
 ) -> Vec<Gaussian> {
     let edge = grid.edge_m();
-    let across = (config.birth_sigma_voxels as f32 * edge).ln();
-    let log_scales = match config.birth_shape {
-        BirthShape::Disc => Vec3::new(across, across, (config.birth_thickness_voxels as f32 * edge).ln()),
+    let across = (rules.sigma_voxels * edge).ln();
+    let log_scales = match rules.shape {
+        BirthShape::Disc => Vec3::new(across, across, (rules.thickness_voxels * edge).ln()),
         BirthShape::Isotropic => Vec3::splat(across),
     };
-    let opacity = config.birth_opacity as f32;
+    let opacity = rules.opacity;
     let opacity_logit = (opacity / (1.0 - opacity)).ln();
-    let points = surface_points(
-        camera,
-        &image.depth_m,
-        clip,
-        config.max_depth_jump as f32,
-        (config.max_incidence_deg as f32).to_radians(),
-    );
+    let points = surface_points(camera, &image.depth_m, clip, rules.max_depth_jump, rules.max_incidence_rad);
     points
         .iter()
-        .filter(|point| grid.claim(point.position, point.footprint_m, config.reseed_ratio as f32))
+        .filter(|point| grid.claim(point.position, point.footprint_m, rules.reseed_ratio))
         .zip(first_id..)
         .map(|(point, id)| Gaussian {
             mean: point.position,
             log_scales,
-            rotation: match config.birth_shape {
+            rotation: match rules.shape {
                 BirthShape::Disc => Quat::from_rotation_arc(Vec3::Z, point.normal),
                 BirthShape::Isotropic => Quat::IDENTITY,
             },
@@ -121,7 +156,7 @@ pub fn insert(
 
 #[cfg(test)]
 mod tests {
-    use splatting::Pose;
+    use crate::Pose;
 
     use super::*;
 
@@ -147,9 +182,9 @@ mod tests {
     fn discs_lie_in_the_plane_that_was_seen_with_the_colour_of_their_pixel() {
         let normal = Vec3::new(0.3, -1.0, 0.2).normalize();
         let (camera, image) = plane_image(Vec3::new(0.4, -2.0, 0.3), normal);
-        let config = TrainerConfig::default();
+        let rules = InsertionRules::default();
         let mut grid = VoxelGrid::new(0.05);
-        let born = insert(&config, &camera, &image, &everything(), &mut grid, 100, 3);
+        let born = insert(&rules, &camera, &image, &everything(), &mut grid, 100, 3);
         assert!(born.len() > 300, "{}", born.len());
         assert_eq!(born.len(), grid.len());
         for (k, gaussian) in born.iter().enumerate() {
@@ -167,19 +202,19 @@ mod tests {
     #[test]
     fn the_same_view_again_adds_nothing_and_a_late_fine_view_finds_room() {
         let normal = Vec3::NEG_Y;
-        let config = TrainerConfig::default();
+        let rules = InsertionRules::default();
         let mut grid = VoxelGrid::new(0.05);
         let (far, far_image) = plane_image(Vec3::new(0.0, -4.0, 0.0), normal);
-        assert!(!insert(&config, &far, &far_image, &everything(), &mut grid, 0, 0).is_empty());
-        assert!(insert(&config, &far, &far_image, &everything(), &mut grid, 0, 1).is_empty());
+        assert!(!insert(&rules, &far, &far_image, &everything(), &mut grid, 0, 0).is_empty());
+        assert!(insert(&rules, &far, &far_image, &everything(), &mut grid, 0, 1).is_empty());
         let (near, near_image) = plane_image(Vec3::new(0.0, -1.5, 0.0), normal);
-        let again = insert(&config, &near, &near_image, &everything(), &mut grid, 0, 2);
+        let again = insert(&rules, &near, &near_image, &everything(), &mut grid, 0, 2);
         assert!(again.len() > 100, "seeded from 2.7 times the footprint: {}", again.len());
     }
 
     #[test]
     fn grazing_points_points_at_edges_and_points_outside_are_left_out() {
-        let config = TrainerConfig::default();
+        let rules = InsertionRules::default();
         // 80 degrees off the normal at the centre.
         let angle = 80f32.to_radians();
         let (camera, image) = plane_image(Vec3::new(0.0, -angle.cos(), angle.sin()) * 2.0, Vec3::NEG_Y);
@@ -200,7 +235,7 @@ mod tests {
         assert_eq!(surface_points(&camera, &image.depth_m, &everything(), 0.05, 1.3).len(), all - 9);
         let small = ClipBox { min: Vec3::splat(-0.2), max: Vec3::splat(0.2) };
         let mut grid = VoxelGrid::new(0.05);
-        let born = insert(&config, &camera, &image, &small, &mut grid, 0, 0);
+        let born = insert(&rules, &camera, &image, &small, &mut grid, 0, 0);
         assert!(!born.is_empty() && born.iter().all(|g| small.contains(g.mean)));
     }
 
@@ -208,7 +243,15 @@ mod tests {
     fn paper_spheres_are_spheres() {
         let (camera, image) = plane_image(Vec3::new(0.0, -2.0, 0.0), Vec3::NEG_Y);
         let mut grid = VoxelGrid::new(0.05);
-        for gaussian in insert(&TrainerConfig::paper(), &camera, &image, &everything(), &mut grid, 0, 0) {
+        for gaussian in insert(
+            &InsertionRules { shape: BirthShape::Isotropic, ..InsertionRules::default() },
+            &camera,
+            &image,
+            &everything(),
+            &mut grid,
+            0,
+            0,
+        ) {
             assert_eq!((gaussian.log_scales.x, gaussian.log_scales.y), (gaussian.log_scales.z, gaussian.log_scales.z));
             assert_eq!(gaussian.rotation, Quat::IDENTITY);
         }

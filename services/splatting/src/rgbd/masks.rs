@@ -5,9 +5,8 @@
 //! the clip box, colour and depth count. *Free*: the measurement lies beyond the box's exit, or the ray misses the box; the
 //! model must be empty there. *Ignored*: no depth, or something before the box.
 
-use splatting::{Camera, PixelClass};
-
 use super::clip_box::ClipBox;
+use crate::{Camera, PixelClass};
 
 /// The class of every pixel of a depth image (metres, 0 = no measurement) taken by `camera`.
 #[must_use]
@@ -37,8 +36,8 @@ pub fn classify(camera: &Camera, depth_m: &[f32], clip: &ClipBox) -> Vec<PixelCl
 
 #[cfg(test)]
 mod tests {
+    use crate::Pose;
     use glam::Vec3;
-    use splatting::Pose;
 
     use super::*;
 

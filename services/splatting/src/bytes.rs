@@ -65,6 +65,14 @@ impl<'a> Reader<'a> {
         Ok(taken)
     }
 
+    /// Reads a number of bytes.
+    ///
+    /// # Errors
+    /// Where the bytes end.
+    pub fn bytes(&mut self, length: usize, what: &'static str) -> Result<&'a [u8], Truncated> {
+        self.take(length, what)
+    }
+
     fn array<const N: usize>(&mut self, what: &'static str) -> Result<[u8; N], Truncated> {
         self.take(N, what)?.try_into().map_err(|_wrong_length| Truncated { at: self.at, what })
     }

@@ -2,9 +2,9 @@
 
 use glam::Vec3;
 use rayon::prelude::*;
-use splatting::{Camera, Gaussian, Gaussians};
 
 use super::clip_box::ClipBox;
+use crate::{Camera, Gaussian, Gaussians};
 
 /// When a Gaussian is wrong.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -98,8 +98,8 @@ pub fn keep_most_contributing(model: &Gaussians, keep_count: usize) -> Vec<bool>
 
 #[cfg(test)]
 mod tests {
+    use crate::Pose;
     use glam::Quat;
-    use splatting::Pose;
 
     use super::*;
 

@@ -1,0 +1,220 @@
+//! `vantage reconstruct`: offline training, shown on the terminal; a mission's model is then measured as the live one was.
+
+use std::io::IsTerminal as _;
+use std::ops::ControlFlow;
+use std::path::Path;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+use anyhow::Context as _;
+use indicatif::{ProgressBar, ProgressStyle};
+use reconstruct::report::Report;
+use reconstruct::{ErrorKind, Event, Options, Outcome, ReconstructError};
+use shared_types::config::{Layer, load};
+use shared_types::folder::MissionFolder;
+
+use crate::cli;
+use crate::evaluate::metrics::Offline;
+use crate::evaluate::truth::Truth;
+use crate::evaluate::{self, Effort, views};
+use crate::exit::{Exit, Refusal};
+use crate::{print, say};
+
+/// Time between two lines where there is no terminal.
+const LINE_PERIOD: Duration = Duration::from_secs(5);
+
+/// Runs the command.
+///
+/// # Errors
+/// What is wrong with the arguments, the dataset or the output folder, with its exit code.
+pub fn run(arguments: &cli::Reconstruct) -> anyhow::Result<Exit> {
+    let options = options_of(arguments);
+    let interrupted = Arc::new(AtomicBool::new(false));
+    for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM] {
+        signal_hook::flag::register(signal, Arc::clone(&interrupted)).context("cannot listen to signals")?;
+    }
+    let mut screen = Screen::new(arguments.quiet);
+    let outcome = reconstruct::run(&options, &mut |event: &Event| {
+        screen.show(event);
+        if interrupted.load(Ordering::Relaxed) { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
+    });
+    screen.clear();
+    match outcome.map_err(refusal)? {
+        Outcome::Stopped { iteration, iterations, out } => {
+            let out = out.display();
+            say(&format!("stopped at iteration {iteration} of {iterations}; the same command goes on ({out})"));
+            Ok(Exit::Failed)
+        }
+        Outcome::Finished { report, out } => {
+            let offline = measure_mission(&options, &report, &out)?;
+            if arguments.json {
+                let mut json = serde_json::to_value(&*report).context("metrics")?;
+                if let Some(offline) = &offline {
+                    json["offline"] = serde_json::to_value(offline).context("metrics")?;
+                }
+                return print(&(serde_json::to_string_pretty(&json).context("metrics")? + "\n"));
+            }
+            print(&table(&report, offline.as_ref(), &out))
+        }
+    }
+}
+
+fn options_of(arguments: &cli::Reconstruct) -> Options {
+    let defaults = Options::new(&arguments.folder);
+    Options {
+        out: arguments.out.clone().unwrap_or_else(|| defaults.out.clone()),
+        iterations: arguments.iterations,
+        strategy: arguments.strategy.map(|strategy| match strategy {
+            cli::Strategy::Default => reconstruct::StrategyName::Default,
+            cli::Strategy::Mcmc => reconstruct::StrategyName::Mcmc,
+            cli::Strategy::None => reconstruct::StrategyName::None,
+        }),
+        max_gaussians: arguments.max_gaussians,
+        sh_degree: arguments.sh_degree,
+        seed: arguments.seed,
+        threads: arguments.threads,
+        eval_every: arguments.eval_every,
+        background: arguments.background.map(|background| match background {
+            cli::Background::Black => reconstruct::Background::Black,
+            cli::Background::White => reconstruct::Background::White,
+            cli::Background::Grey => reconstruct::Background::Grey,
+            cli::Background::Random => reconstruct::Background::Random,
+        }),
+        mask: match arguments.mask {
+            cli::Mask::Auto => reconstruct::MaskUse::Auto,
+            cli::Mask::Ignore => reconstruct::MaskUse::Ignore,
+            cli::Mask::Empty => reconstruct::MaskUse::Empty,
+            cli::Mask::Off => reconstruct::MaskUse::Off,
+        },
+        downscale: arguments.downscale,
+        images: arguments.images.clone(),
+        hold_out: arguments.hold_out,
+        memory_bytes: arguments.memory.map(|megabytes| megabytes.saturating_mul(1_000_000)),
+        overwrite: arguments.overwrite,
+        checkpoint_period: Duration::from_millis(arguments.checkpoint_ms),
+        ..defaults
+    }
+}
+
+/// The error with the exit code of its kind.
+fn refusal(error: ReconstructError) -> anyhow::Error {
+    let exit = match error.kind() {
+        ErrorKind::Usage => Exit::Usage,
+        ErrorKind::Missing => Exit::Missing,
+        ErrorKind::Failed => Exit::Failed,
+        ErrorKind::Internal => Exit::Internal,
+    };
+    Refusal { exit, message: error.to_string() }.into()
+}
+
+/// Measures the model of a simulated mission on the views that its live model is measured on, and notes it beside that one.
+/// `None` for other datasets, and for missions without a truth to compare with.
+fn measure_mission(options: &Options, report: &Report, out: &Path) -> anyhow::Result<Option<Offline>> {
+    let Ok(folder) = MissionFolder::open(&options.folder) else { return Ok(None) };
+    if !folder.config_path().is_file() {
+        return Ok(None);
+    }
+    let config = load(&[Layer::of_file(&folder.config_path())?])?;
+    if !config.link.is_local() {
+        return Ok(None);
+    }
+    let model = evaluate::read_model(&out.join("model.ply"))?;
+    let truth = Truth::build(&config)?;
+    let effort = Effort::of(&config);
+    let quality = views::appearance(&truth, &model, &views::held_out(&truth, effort)?, effort)?;
+    let mut offline = Offline {
+        iterations: Some(report.run.iterations),
+        keyframes: Some(report.run.training),
+        gaussians: Some(report.gaussians),
+        seconds: report.last().map(|row| row.wall_s),
+        ..Offline::default()
+    };
+    offline.take(&quality);
+    if let Some(mut metrics) = evaluate::read_metrics(&folder)? {
+        metrics.offline = offline.clone();
+        evaluate::write_metrics(&folder, &metrics)?;
+    }
+    Ok(Some(offline))
+}
+
+/// What a run ends with.
+fn table(report: &Report, offline: Option<&Offline>, out: &Path) -> String {
+    let mut rows: Vec<(String, String)> = vec![
+        ("iterations".to_owned(), report.run.iterations.to_string()),
+        ("Gaussians".to_owned(), report.gaussians.to_string()),
+        ("iterations a second".to_owned(), format!("{:.1}", report.iterations_per_s)),
+        ("processor time an iteration".to_owned(), format!("{:.1} ms", report.cpu_ms_per_iteration)),
+    ];
+    let mut row = |name: &str, value: Option<f64>, unit: &str, digits: usize| {
+        rows.extend(value.map(|value| (name.to_owned(), format!("{value:.digits$}{unit}"))));
+    };
+    if let Some(last) = report.last() {
+        row("PSNR training images", last.train_psnr_db, " dB", 2);
+        row("PSNR held-out images", last.held_out_psnr_db, " dB", 2);
+        row("SSIM held-out images", last.held_out_ssim, "", 4);
+    }
+    if let Some(offline) = offline {
+        row("PSNR object, true views at R", offline.psnr_object_db, " dB", 2);
+        row("PSNR object, true views at 0.8 R", offline.psnr_object_near_db, " dB", 2);
+        row("SSIM object, true views at R", offline.ssim_object, "", 4);
+    }
+    row("memory", report.memory.peak_rss_mb, " MB", 0);
+    let mut text = String::new();
+    for (name, value) in rows {
+        text += &format!("{name:<34}{value}\n");
+    }
+    let out = out.display();
+    text + &format!(
+        "\nmodel     {out}/model.ply\nfigures   {out}/metrics.{{csv,json}}\npictures  {out}/{{curve,held-out}}.png\n"
+    )
+}
+
+/// What the user sees of a run: a line that changes on a terminal, else a line every few seconds.
+struct Screen {
+    quiet: bool,
+    bar: Option<ProgressBar>,
+    last: Option<Instant>,
+}
+
+impl Screen {
+    fn new(quiet: bool) -> Self {
+        let bar = (!quiet && std::io::stderr().is_terminal()).then(|| {
+            let bar = ProgressBar::new_spinner();
+            if let Ok(style) = ProgressStyle::with_template("{spinner} {wide_msg}") {
+                bar.set_style(style);
+            }
+            bar
+        });
+        Self { quiet, bar, last: None }
+    }
+
+    fn show(&mut self, event: &Event) {
+        if self.quiet {
+            return;
+        }
+        match (event, &self.bar) {
+            (Event::Trained(_), Some(bar)) => {
+                bar.set_message(event.line());
+                bar.tick();
+            }
+            (Event::Trained(_), None) => {
+                if self.last.is_none_or(|last| last.elapsed() >= LINE_PERIOD) {
+                    self.last = Some(Instant::now());
+                    say(&event.line());
+                }
+            }
+            (_, Some(bar)) => bar.suspend(|| say(&event.line())),
+            (_, None) => say(&event.line()),
+        }
+    }
+
+    fn clear(&self) {
+        if let Some(bar) = &self.bar {
+            bar.finish_and_clear();
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests;

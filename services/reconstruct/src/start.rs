@@ -1,0 +1,197 @@
+//! The model that training begins with: from depth as in live flight, else from sparse points, else at random.
+
+use glam::{DMat3, DVec3, Vec3};
+use shared_types::config::trainer::BirthShape;
+use splatting::rgbd::clip_box::ClipBox;
+use splatting::rgbd::insertion::{self, InsertionRules};
+use splatting::rgbd::prune;
+use splatting::rgbd::voxels::{VoxelGrid, voxel_edge_m};
+use splatting::{Camera, ColoredPoint, Gaussians, InitialGaussians, random_points};
+
+use crate::dataset::{Dataset, Image, Stage};
+
+/// Random points where nothing better is known, as many as 3DGS takes.
+const RANDOM_POINTS: usize = 100_000;
+/// Sparse points below which a model begins with random ones besides: their neighbours say little of the scene.
+const LEAST_POINTS: usize = 4;
+/// Edge of an insertion voxel over the footprint of a pixel, where no mission says otherwise.
+const VOXEL_FACTOR: f64 = 1.2;
+
+/// Where a model comes from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Origin {
+    /// Depth images.
+    Depth,
+    /// Sparse points.
+    Points,
+    /// Nothing.
+    Random,
+}
+
+impl Origin {
+    /// Its name in messages.
+    #[must_use]
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Depth => "depth images",
+            Self::Points => "sparse points",
+            Self::Random => "random points",
+        }
+    }
+}
+
+/// A model to begin with.
+#[derive(Debug)]
+pub struct Start {
+    /// The Gaussians.
+    pub model: Gaussians,
+    /// Where they come from.
+    pub origin: Origin,
+}
+
+/// Edge of the voxels that Gaussians are inserted by; `None` without depth.
+#[must_use]
+pub fn voxel_m(dataset: &Dataset, training: &[usize]) -> Option<f32> {
+    let with_depth = || training.iter().filter_map(|&index| dataset.images.get(index)).filter(|i| i.depth_m.is_some());
+    let focal = f64::from(with_depth().next()?.camera.fx);
+    let edge = match &dataset.stage {
+        Some(stage) if stage.trainer.voxel_m > 0.0 => stage.trainer.voxel_m,
+        Some(stage) => voxel_edge_m(stage.trainer.voxel_factor, stage.radius_m, stage.box_size_m, focal),
+        None => {
+            let mut depths: Vec<f32> = with_depth()
+                .flat_map(|image| image.depth_m.iter().flatten().step_by(97).copied().filter(|d| *d > 0.0))
+                .collect();
+            depths.sort_unstable_by(f32::total_cmp);
+            VOXEL_FACTOR * f64::from(*depths.get(depths.len() / 2)?) / focal
+        }
+    };
+    Some(edge as f32)
+}
+
+/// The model that training on these images begins with, of degree `sh_degree`.
+#[must_use]
+pub fn start(
+    dataset: &Dataset,
+    training: &[usize],
+    how: InitialGaussians,
+    (max_gaussians, sh_degree, seed): (usize, u8, u64),
+) -> Start {
+    let images: Vec<&Image> = training.iter().filter_map(|&index| dataset.images.get(index)).collect();
+    let from_depth = voxel_m(dataset, training).map(|edge| from_depth(&images, dataset.stage.as_ref(), edge));
+    let (mut model, origin) = match from_depth {
+        Some(model) if !model.is_empty() => (model, Origin::Depth),
+        _ => from_points(dataset, &images, how, max_gaussians, seed),
+    };
+    let kept = prune::keep_most_contributing(&model, max_gaussians);
+    model.retain(|index| kept[index]);
+    model.set_sh_degree(sh_degree);
+    let order = model.morton_order();
+    model.permute(&order);
+    Start { model, origin }
+}
+
+fn from_depth(images: &[&Image], stage: Option<&Stage>, edge_m: f32) -> Gaussians {
+    let everywhere = ClipBox { min: Vec3::splat(f32::MIN), max: Vec3::splat(f32::MAX) };
+    let clip = stage.map_or(everywhere, |stage| stage.clip);
+    let rules = stage.map_or_else(InsertionRules::default, insertion_rules);
+    let mut grid = VoxelGrid::new(edge_m);
+    let mut model = Gaussians::new();
+    for image in images {
+        if let Some(small) = image.with_depth() {
+            let first_id = model.len() as u64;
+            model.extend(insertion::insert(&rules, &image.camera, &small, &clip, &mut grid, first_id, 0));
+        }
+    }
+    model
+}
+
+fn insertion_rules(stage: &Stage) -> InsertionRules {
+    let trainer = &stage.trainer;
+    InsertionRules {
+        shape: match trainer.birth_shape {
+            BirthShape::Disc => insertion::BirthShape::Disc,
+            BirthShape::Isotropic => insertion::BirthShape::Isotropic,
+        },
+        sigma_voxels: trainer.birth_sigma_voxels as f32,
+        thickness_voxels: trainer.birth_thickness_voxels as f32,
+        opacity: trainer.birth_opacity as f32,
+        max_incidence_rad: (trainer.max_incidence_deg as f32).to_radians(),
+        max_depth_jump: trainer.max_depth_jump as f32,
+        reseed_ratio: trainer.reseed_ratio as f32,
+    }
+}
+
+fn from_points(
+    dataset: &Dataset,
+    images: &[&Image],
+    how: InitialGaussians,
+    max_gaussians: usize,
+    seed: u64,
+) -> (Gaussians, Origin) {
+    let colored = |point: &crate::dataset::Point| ColoredPoint {
+        position: point.position.as_vec3(),
+        color: point.rgb.map(|value| f32::from(value) / 255.0),
+    };
+    // A share of them where they are too many, evenly over their list.
+    let stride = dataset.points.len().div_ceil(max_gaussians).max(1);
+    let points: Vec<ColoredPoint> =
+        dataset.points.iter().step_by(stride).map(colored).filter(|point| point.position.is_finite()).collect();
+    if points.len() >= LEAST_POINTS
+        && let Ok(model) = how.from_points(&points)
+    {
+        return (model, Origin::Points);
+    }
+    let cameras: Vec<&Camera> = images.iter().map(|image| &image.camera).collect();
+    let (center, half) = focus(&cameras);
+    let count = RANDOM_POINTS.min(max_gaussians);
+    let model = random_points(count, center - half, center + half, seed)
+        .and_then(|points| how.from_points(&points))
+        .unwrap_or_default();
+    (model, Origin::Random)
+}
+
+/// Centre of what the cameras look at, and half the edge of a cube about it: the point nearest to all optical axes, and half
+/// the cameras' mean distance from it.
+fn focus(cameras: &[&Camera]) -> (Vec3, Vec3) {
+    let (mut a, mut b) = (DMat3::ZERO, DVec3::ZERO);
+    for camera in cameras {
+        let axis = (camera.world_from_camera.rotation * Vec3::Z).as_dvec3();
+        let across = DMat3::IDENTITY - DMat3::from_cols(axis * axis.x, axis * axis.y, axis * axis.z);
+        a += across;
+        b += across * camera.world_from_camera.translation.as_dvec3();
+    }
+    let count = cameras.len().max(1) as f64;
+    let eyes: Vec<DVec3> = cameras.iter().map(|camera| camera.world_from_camera.translation.as_dvec3()).collect();
+    let mean_eye = eyes.iter().sum::<DVec3>() / count;
+    // Nearly parallel axes meet nowhere in particular.
+    let center = if a.determinant() > 1e-6 * count.powi(3) { a.inverse() * b } else { mean_eye };
+    let distance = eyes.iter().map(|eye| eye.distance(center)).sum::<f64>() / count;
+    let half = (0.5 * distance).clamp(1e-3, 1e6) as f32;
+    (center.as_vec3(), Vec3::splat(half))
+}
+
+#[cfg(test)]
+mod tests {
+    use splatting::Pose;
+
+    use super::*;
+
+    #[test]
+    fn cameras_on_a_ring_look_at_its_centre() {
+        let target = Vec3::new(1.0, -2.0, 0.5);
+        let cameras: Vec<Camera> = (0..6)
+            .map(|k| {
+                let angle = k as f32;
+                let eye = target + 3.0 * Vec3::new(angle.cos(), angle.sin(), 0.3);
+                Camera::from_hfov(Pose::IDENTITY, 1.0, 32, 24).look_at(eye, target, Vec3::Z)
+            })
+            .collect();
+        let (center, half) = focus(&cameras.iter().collect::<Vec<_>>());
+        assert!((center - target).length() < 1e-3, "{center}");
+        assert!((half.x - 1.5 * 1.044).abs() < 0.01, "{half}");
+        // Parallel axes: a box about the cameras, and no panic.
+        let parallel = [cameras[0], cameras[0]];
+        let (center, half) = focus(&parallel.iter().collect::<Vec<_>>());
+        assert!(center.is_finite() && half.is_finite() && half.x > 0.0);
+    }
+}
