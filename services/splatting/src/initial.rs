@@ -3,9 +3,9 @@
 use glam::{Quat, Vec3};
 use thiserror::Error;
 
-use crate::densify::random::Random;
 use crate::model::{Gaussian, Gaussians};
 use crate::neighbours::neighbour_distances;
+use crate::random::Random;
 
 /// Smallest standard deviation that a Gaussian begins with: where points coincide, as 3DGS bounds their squared distance
 /// by 1e-7.

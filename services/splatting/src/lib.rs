@@ -25,6 +25,7 @@ mod neighbours;
 mod optimiser;
 pub mod order;
 mod projection;
+mod random;
 pub mod reference;
 pub mod rgbd;
 mod schedule;

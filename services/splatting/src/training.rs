@@ -38,7 +38,8 @@ pub struct Gradient {
 }
 
 impl Engine {
-    /// One step of Adam on one view. Only Gaussians that changed a pixel of the view move, each with its own step count.
+    /// One step of Adam on one view. Only Gaussians that changed a pixel of the view move, each with its own step count;
+    /// with a weight of the mean opacity or scale, all of them do.
     ///
     /// Gaussians that the optimiser does not know yet get zero state. Broken Gaussians (not finite) and broken
     /// gradients are left alone, so nothing that is finite before the step is not finite after it.

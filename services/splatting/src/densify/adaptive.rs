@@ -4,9 +4,9 @@
 //! is too coarse: a small one is cloned, a large one is split. Transparent and oversized ones are removed, and opacities
 //! are brought down now and then so that what no view needs does not come back.
 
-use super::random::Random;
 use super::{DensifyError, DensifyReport, Lists, fraction, interval, positive, scale_iterations};
 use crate::model::Gaussian;
+use crate::random::Random;
 
 /// Settings of adaptive density control. The defaults are those of 3DGS (`OptimizationParams` of its code) and of
 /// gsplat's `DefaultStrategy`, which agree; iterations are of a run of 30,000.

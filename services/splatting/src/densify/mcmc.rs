@@ -1,8 +1,8 @@
 //! 3DGS-MCMC (Kheradmand et al. 2024): Gaussians as samples of a distribution, moved and added so that the image stays.
 
-use super::random::Random;
 use super::{DensifyError, DensifyReport, Lists, fraction, interval, positive, scale_iterations};
 use crate::model::{Gaussian, Gaussians};
+use crate::random::Random;
 
 /// Settings of 3DGS-MCMC. The defaults are those of its code and of gsplat's `MCMCStrategy`, which agree; iterations are
 /// of a run of 30,000. Both begin with opacity 0.5 and a tenth of the usual scales: [`InitialGaussians::MCMC`].

@@ -7,20 +7,19 @@
 mod adaptive;
 mod mcmc;
 mod noise;
-pub(crate) mod random;
 
 use thiserror::Error;
 
 use crate::engine::Engine;
 use crate::model::{Gaussian, Gaussians};
 use crate::optimiser::Optimiser;
+use crate::random::Random;
 use crate::settings::TrainingSettings;
 use crate::statistics::ScreenStatistics;
 
 pub use adaptive::DefaultSettings;
 pub use mcmc::{McmcSettings, Relocation};
 use noise::Noise;
-use random::Random;
 
 /// How the number of Gaussians changes in training.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]

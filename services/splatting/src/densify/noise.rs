@@ -7,10 +7,10 @@
 #![expect(unsafe_code, reason = "tasks write disjoint parts of shared buffers")]
 
 use super::mcmc::McmcSettings;
-use super::random::Random;
 use crate::engine::Engine;
 use crate::model::{Block, Gaussians, LANES, ROW_LOG_SCALE, ROW_MEAN, ROW_OPACITY, ROW_ROTATION};
 use crate::projection::{VALUE_MAX, rotation_matrix};
+use crate::random::Random;
 use crate::simd::{Kernel, Simd, build, dispatch};
 use crate::workers::Shared;
 

@@ -4,9 +4,9 @@ use glam::{Quat, Vec3};
 
 use super::Random;
 use crate::{
-    Camera, ColoredPoint, DefaultSettings, Densifier, Engine, Gaussian, Gaussians, InitialGaussians, McmcSettings,
-    Optimiser, Pose, RenderSettings, Rendered, Schedule, ScreenStatistics, Strategy, TrainingSettings, TrainingView,
-    metrics, scene_extent,
+    Camera, ColoredPoint, DefaultSettings, Densifier, DensifierState, Engine, Gaussian, Gaussians, InitialGaussians,
+    McmcSettings, Optimiser, Pose, RenderSettings, Rendered, Schedule, ScreenStatistics, Strategy, TrainingSettings,
+    TrainingView, metrics, scene_extent,
 };
 
 /// A bumpy sphere of about 0.5 m with fine stripes, as Gaussians lying on its surface.
@@ -79,8 +79,15 @@ fn observed_scene() -> Scene {
     Scene { views, held_out: images(cameras(5, 0.5)), points, extent_m }
 }
 
-/// Trains as an offline trainer does; returns the model and the mean PSNR of the held-out views.
-fn train(scene: &Scene, strategy: Strategy, threads: usize, iterations: u32) -> (Gaussians, f64) {
+/// Trains as an offline trainer does, with all but the model saved and restored before one iteration; returns the model
+/// and the mean PSNR of the held-out views.
+fn train(
+    scene: &Scene,
+    strategy: Strategy,
+    threads: usize,
+    iterations: u32,
+    interruption: Option<u32>,
+) -> (Gaussians, f64) {
     let factor = f64::from(iterations) / 30_000.0;
     let schedule = Schedule { sh_degree: 0, ..Schedule::published(scene.extent_m) }.scaled(factor);
     let initial =
@@ -92,6 +99,11 @@ fn train(scene: &Scene, strategy: Strategy, threads: usize, iterations: u32) -> 
     let mut settings = TrainingSettings { depth_weight: 0.0, free_weight: 0.0, ..TrainingSettings::default() };
     strategy.apply(&mut settings);
     for iteration in 0..iterations {
+        if Some(iteration) == interruption {
+            let state = DensifierState::from_bytes(&densifier.state().to_bytes());
+            densifier = Densifier::resume(strategy, scene.extent_m, state).unwrap();
+            statistics = ScreenStatistics::decode(&statistics.encode(), model.len()).unwrap();
+        }
         schedule.apply(iteration, &mut settings);
         let view = &scene.views[(iteration as usize * 7) % scene.views.len()];
         if densifier.observes(iteration) {
@@ -129,21 +141,23 @@ fn strategies() -> [Strategy; 3] {
 #[test]
 fn both_strategies_show_views_that_were_held_out_better_than_none() {
     let scene = observed_scene();
-    let [(none, none_db), (default, default_db), (mcmc, mcmc_db)] = strategies().map(|s| train(&scene, s, 1, 1200));
+    let [(none, none_db), (default, default_db), (mcmc, mcmc_db)] =
+        strategies().map(|s| train(&scene, s, 1, 1200, None));
     assert_eq!(none.len(), scene.points.len());
     assert!((1000..=4000).contains(&default.len()) && mcmc.len() == 2500, "{} {}", default.len(), mcmc.len());
     let margin = default_db.min(mcmc_db) - none_db;
     assert!(margin > 1.0, "{none_db:.2} dB without, {default_db:.2} dB by default, {mcmc_db:.2} dB with MCMC");
 }
 
-/// Same seed, same bits, for any number of threads: statistics, growth, noise, order.
+/// Same seed, same bits, for any number of threads and interrupted or not: statistics, growth, noise, order.
 #[test]
-fn a_run_gives_the_same_bits_for_any_number_of_threads() {
+fn a_run_gives_the_same_bits_for_any_number_of_threads_interrupted_or_not() {
     let scene = observed_scene();
     for strategy in strategies() {
-        let one = train(&scene, strategy, 1, 110);
+        let one = train(&scene, strategy, 1, 110, None);
         assert!(strategy == Strategy::None || one.0.len() > scene.points.len());
-        assert!(one == train(&scene, strategy, 2, 110));
-        assert!(one == train(&scene, strategy, 3, 110));
+        assert!(one == train(&scene, strategy, 2, 110, None));
+        // Between two refinements, with statistics half gathered.
+        assert!(one == train(&scene, strategy, 3, 110, Some(90)));
     }
 }

@@ -7,6 +7,7 @@ mod forward;
 mod gradients;
 mod harmonics;
 mod hostile;
+mod mcmc;
 mod statistics;
 mod training;
 
