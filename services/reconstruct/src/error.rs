@@ -191,7 +191,7 @@ pub enum ReconstructError {
         /// The file.
         path: PathBuf,
         /// The encoder's reason.
-        source: splatting::formats::WriteError,
+        source: std::io::Error,
     },
     /// A picture cannot be encoded.
     #[error("{path}: cannot be encoded: {source}")]

@@ -108,9 +108,8 @@ pub struct Report {
     pub run: Identity,
     /// What the model began with.
     pub origin: String,
-    /// Gaussians that it began with; absent where that was before a kill.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub first_gaussians: Option<usize>,
+    /// Gaussians that it began with.
+    pub first_gaussians: usize,
     /// Gaussians in the end.
     pub gaussians: usize,
     /// Least and greatest width of the images, pixels.

@@ -83,7 +83,7 @@ pub fn run(options: &Options, observer: &mut dyn Observer) -> Result<Outcome, Re
     let identity = Identity::of(options, &dataset, &split, strategy, &format!("{:?}", engine.isa()));
     let resumed = output.admit(&identity, options.overwrite)?;
     let mut run = Run::new(options, &dataset, &split, engine, output, identity, memory_bytes, resumed)?;
-    if run.first_gaussians.is_none() {
+    if run.resumed {
         flow = both(flow, observer.on(&Event::Resumed { iteration: run.state.progression.iteration }));
     } else {
         let began = Event::Began { origin: run.origin.name(), gaussians: run.state.model.len() };
@@ -111,8 +111,7 @@ struct Run<'a> {
     identity: Identity,
     run_sum: u64,
     origin: Origin,
-    /// `None` where it was resumed.
-    first_gaussians: Option<usize>,
+    resumed: bool,
     held_out_psnr_db: Option<f64>,
 }
 
@@ -132,8 +131,8 @@ impl<'a> Run<'a> {
         let training = images(&split.training);
         let extent_m = scene_extent(training.iter().map(|image| &image.camera)).unwrap_or(1.0);
         let recipe = Recipe::new(options, dataset, extent_m, start::voxel_m(dataset, &split.training));
-        let (state, origin, first_gaussians) = match resumed {
-            Some(state) => (state, Origin::Depth, None),
+        let (state, origin, resumed) = match resumed {
+            Some(state) => (state, start::origin(dataset, &split.training), true),
             None => {
                 let how = match recipe.strategy {
                     Strategy::Mcmc(_) => InitialGaussians::MCMC,
@@ -141,9 +140,8 @@ impl<'a> Run<'a> {
                 };
                 let bounds = (options.max_gaussians, options.sh_degree, options.seed);
                 let start = start::start(dataset, &split.training, how, bounds);
-                let first = start.model.len();
                 let densifier = Densifier::new(recipe.strategy, extent_m, options.seed, &start.model)?;
-                (State::begin(start.model, &densifier, options.seed, training.len()), start.origin, Some(first))
+                (State::begin(start.model, &densifier, options.seed, training.len()), start.origin, false)
             }
         };
         let densifier = Densifier::resume(recipe.strategy, extent_m, state.progression.densifier)?;
@@ -161,7 +159,7 @@ impl<'a> Run<'a> {
             output,
             identity,
             origin,
-            first_gaussians,
+            resumed,
             held_out_psnr_db,
         })
     }
@@ -328,7 +326,7 @@ impl<'a> Run<'a> {
         Report {
             run: self.identity.clone(),
             origin: self.origin.name().to_owned(),
-            first_gaussians: self.first_gaussians,
+            first_gaussians: p.rows.first().map_or(0, |row| row.gaussians),
             gaussians: self.state.model.len(),
             width_px: [widths().min().unwrap_or(0), widths().max().unwrap_or(0)],
             up: self.dataset.up.to_array(),

@@ -12,7 +12,7 @@ use crate::dataset::{Dataset, Image, Stage};
 
 /// Random points where nothing better is known, as many as 3DGS takes.
 const RANDOM_POINTS: usize = 100_000;
-/// Sparse points below which a model begins with random ones besides: their neighbours say little of the scene.
+/// Sparse points below which a model begins with random ones: distances between neighbours need as many.
 const LEAST_POINTS: usize = 4;
 /// Edge of an insertion voxel over the footprint of a pixel, where no mission says otherwise.
 const VOXEL_FACTOR: f64 = 1.2;
@@ -66,6 +66,18 @@ pub fn voxel_m(dataset: &Dataset, training: &[usize]) -> Option<f32> {
         }
     };
     Some(edge as f32)
+}
+
+/// Where the model that training on these images begins with comes from: what [`start`] says, without making it.
+#[must_use]
+pub fn origin(dataset: &Dataset, training: &[usize]) -> Origin {
+    if voxel_m(dataset, training).is_some() {
+        Origin::Depth
+    } else if dataset.points.len() >= LEAST_POINTS {
+        Origin::Points
+    } else {
+        Origin::Random
+    }
 }
 
 /// The model that training on these images begins with, of degree `sh_degree`.

@@ -61,7 +61,11 @@ pub fn run(arguments: &Evaluate) -> anyhow::Result<Exit> {
         effort.width = width.clamp(32, 4096);
         effort.height = (effort.width * config.camera.height_px).div_ceil(config.camera.width_px.max(1)).max(1);
     }
-    let metrics = measure(&folder, &config, effort, arguments.model.as_deref())?;
+    let mut metrics = measure(&folder, &config, effort, arguments.model.as_deref())?;
+    // What `vantage reconstruct` noted there is not measured here, and stays.
+    if let Some(before) = read_metrics(&folder)? {
+        metrics.offline = before.offline;
+    }
     // Figures of another model, or of other views than every mission is measured on, are not the mission's.
     if arguments.model.is_none() && effort == official {
         write_metrics(&folder, &metrics)?;
