@@ -63,9 +63,12 @@ impl Turn {
         (self.matrix * mean.as_dvec3()).as_vec3()
     }
 
-    /// A rotation from a Gaussian's axes after the turn; of the same length as before.
+    /// A rotation from a Gaussian's axes after the turn; of the same length as before, or of length 1 where f32 has not
+    /// that length in other directions.
     pub fn rotation(&self, rotation: Quat) -> Quat {
-        (self.quaternion * rotation.as_dquat()).as_quat()
+        let turned = self.quaternion * rotation.as_dquat();
+        let single = turned.as_quat();
+        if single.is_finite() { single } else { turned.normalize().as_quat() }
     }
 
     /// Coefficients above degree 0 after the turn.

@@ -65,7 +65,9 @@ impl ShRotation {
     /// Where `k` is not below [`SH_REST_MAX`].
     pub fn coefficient(&self, k: usize, before: &[[f32; 3]; SH_REST_MAX]) -> [f32; 3] {
         std::array::from_fn(|channel| {
-            band(k).map(|n| self.matrix[k][n] * f64::from(before[n][channel])).sum::<f64>() as f32
+            let turned: f64 = band(k).map(|n| self.matrix[k][n] * f64::from(before[n][channel])).sum();
+            // A sum of the largest finite numbers stays finite.
+            turned.clamp(f64::from(f32::MIN), f64::from(f32::MAX)) as f32
         })
     }
 

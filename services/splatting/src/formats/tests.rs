@@ -92,6 +92,27 @@ fn a_broken_model_is_written_in_no_format_and_the_parameter_named() {
 }
 
 #[test]
+fn the_largest_parameters_stay_finite() {
+    const MAX: f32 = f32::MAX;
+    let mut model = model(2, 3, 1);
+    let large = glam::Quat::from_xyzw(MAX, -MAX, MAX, MAX);
+    let tiny = Vec3::splat(-MAX);
+    model.set(0, &Gaussian { rotation: large, opacity_logit: MAX, sh: [MAX; 3], log_scales: tiny, ..model.get(0) });
+    model.set(1, &Gaussian { rotation: -large, opacity_logit: -MAX, sh: [-MAX; 3], ..model.get(1) });
+    model.set_sh_rest(0, &[[MAX, -MAX, MAX]; SH_REST_MAX]);
+    for format in Format::ALL {
+        let back = read(format, &bytes(format, &model)).unwrap();
+        assert!(back.is_finite(), "{format:?}");
+        for (i, g) in model.iter().enumerate() {
+            let found = back.iter().find(|b| (b.mean - g.mean).length() < 1e-3).unwrap();
+            assert!(angle_between(found.rotation, g.rotation) < 0.03, "{format:?}, {i}");
+        }
+    }
+    frames::Turn::world_to_y_up().apply(&mut model);
+    assert!(model.is_finite());
+}
+
+#[test]
 fn scales_beyond_f32_are_refused_where_the_format_has_no_logarithms() {
     let mut model = bare(3);
     model.set(1, &Gaussian { log_scales: Vec3::new(0.0, 90.0, 0.0), ..model.get(1) });

@@ -33,7 +33,7 @@ use self::quantise::{
     log_scale_to_byte, rotation_from_bytes, rotation_from_v2_bytes, rotation_to_bytes, sh_from_byte, sh_to_byte,
 };
 use super::frames::Turn;
-use super::{WriteError, check_finite, logit_of_byte, opacity, to_byte};
+use super::{WriteError, check_finite, logit_of_byte, opacity, to_byte, unit_rotation};
 use crate::model::{Gaussian, Gaussians, SH_DEGREE_MAX, SH_REST_MAX, sh_rest_coefficients};
 
 const MAGIC: [u8; 4] = *b"NGSP";
@@ -139,7 +139,7 @@ pub fn write(gaussians: &Gaussians, antialiased: bool, to: &mut impl Write) -> R
         gzip.write_all(&g.log_scales.to_array().map(log_scale_to_byte))?;
     }
     for g in gaussians.iter() {
-        gzip.write_all(&rotation_to_bytes(turn.rotation(g.rotation)))?;
+        gzip.write_all(&rotation_to_bytes(turn.rotation(unit_rotation(&g).as_quat())))?;
     }
     if coefficients > 0 {
         for index in 0..gaussians.len() {
