@@ -34,14 +34,14 @@ fn a_mission_is_reconstructed_through_kills_with_the_same_bits() {
     let mission = base.path().join("mission");
     Flight::start(&mission, &["--preset", "tiny", "--seed", "4"]).finish_well();
     let live = metrics(&mission);
-    let arguments = ["--iterations", "1500", "--eval-every", "500", "--hold-out", "6", "--sh-degree", "1"];
+    let arguments = ["--iterations", "600", "--eval-every", "300", "--hold-out", "6", "--sh-degree", "1"];
     let (whole, broken, single) = (base.path().join("whole"), base.path().join("broken"), base.path().join("single"));
 
     let (status, text) = run(reconstruct(&mission, &whole, &[&arguments[..], &["--json"]].concat()));
     assert_eq!(status, Some(0), "{text}");
     let after = metrics(&mission);
     let number = |a: &str, b: &str| after[a][b].as_f64().unwrap_or_else(|| panic!("{a}.{b} in {after:#}"));
-    assert_eq!(after["offline"]["iterations"], 1500);
+    assert_eq!(after["offline"]["iterations"], 600);
     assert_eq!(after["offline"]["keyframes"], 5);
     assert!(number("offline", "psnr_object_db") > number("live", "psnr_init_db") + 1.0, "{after:#}");
     assert_eq!(after["live"], live["live"], "nothing else changes");

@@ -14,6 +14,8 @@ use crate::dataset::{Dataset, Image, Stage};
 const RANDOM_POINTS: usize = 100_000;
 /// Sparse points below which a model begins with random ones: distances between neighbours need as many.
 const LEAST_POINTS: usize = 4;
+/// Most Gaussians that depth images give where no mission says how finely: densification adds where more are needed.
+const DEPTH_POINTS: usize = 200_000;
 /// Edge of an insertion voxel over the footprint of a pixel, where no mission says otherwise.
 const VOXEL_FACTOR: f64 = 1.2;
 
@@ -89,8 +91,12 @@ pub fn start(
     (max_gaussians, sh_degree, seed): (usize, u8, u64),
 ) -> Start {
     let images: Vec<&Image> = training.iter().filter_map(|&index| dataset.images.get(index)).collect();
-    let from_depth = voxel_m(dataset, training).map(|edge| from_depth(&images, dataset.stage.as_ref(), edge));
-    let (mut model, origin) = match from_depth {
+    let most = max_gaussians.min(DEPTH_POINTS);
+    let inserted = voxel_m(dataset, training).map(|edge| match &dataset.stage {
+        Some(stage) => from_depth(&images, Some(stage), edge),
+        None => from_depth_at_most(&images, edge, most),
+    });
+    let (mut model, origin) = match inserted {
         Some(model) if !model.is_empty() => (model, Origin::Depth),
         _ => from_points(dataset, &images, how, max_gaussians, seed),
     };
@@ -100,6 +106,20 @@ pub fn start(
     let order = model.morton_order();
     model.permute(&order);
     Start { model, origin }
+}
+
+/// As [`from_depth`] without a stage, with voxels so large that at most `most` Gaussians come of it: leaving some of them out
+/// would leave holes.
+fn from_depth_at_most(images: &[&Image], edge_m: f32, most: usize) -> Gaussians {
+    let mut edge_m = edge_m;
+    loop {
+        let model = from_depth(images, None, edge_m);
+        if model.len() <= most {
+            return model;
+        }
+        // Surfaces: the number falls with the square of the edge. At least a tenth more, so that this ends.
+        edge_m *= ((model.len() as f32 / most as f32).sqrt()).max(1.1);
+    }
 }
 
 fn from_depth(images: &[&Image], stage: Option<&Stage>, edge_m: f32) -> Gaussians {
@@ -187,6 +207,25 @@ mod tests {
     use splatting::Pose;
 
     use super::*;
+
+    #[test]
+    fn larger_voxels_and_not_holes_make_room() {
+        let camera = Camera::from_hfov(Pose::IDENTITY, 1.0, 64, 48);
+        let image = Image {
+            name: "a".to_owned(),
+            camera,
+            colors: crate::dataset::Colors::Bytes(vec![[9; 3]; 64 * 48]),
+            depth_m: Some(vec![2.0; 64 * 48]),
+            classes: None,
+            held_out: None,
+        };
+        let all = from_depth_at_most(&[&image], 0.01, 10_000);
+        assert_eq!(all.len(), 62 * 46);
+        let few = from_depth_at_most(&[&image], 0.01, 500);
+        assert!((200..=500).contains(&few.len()), "{}", few.len());
+        let reach = |model: &Gaussians| model.iter().map(|g| g.mean.x).fold(f32::MIN, f32::max);
+        assert!(reach(&all) - reach(&few) < 0.15, "to the border of the image");
+    }
 
     #[test]
     fn cameras_on_a_ring_look_at_its_centre() {
