@@ -34,8 +34,8 @@ impl Item {
 pub(crate) fn sort_by_key(workers: &Workers, items: &mut [Item], spare: &mut [Item], low: u32, high: u32) {
     let range_bits = u32::BITS - high.saturating_sub(low).leading_zeros();
     let shift = range_bits.saturating_sub(2 * DIGIT_BITS);
-    let low_digit = |item: &Item| (item.key - low >> shift) as usize % DIGITS;
-    let high_digit = |item: &Item| (item.key - low >> (shift + DIGIT_BITS)) as usize % DIGITS;
+    let low_digit = |item: &Item| ((item.key - low) >> shift) as usize % DIGITS;
+    let high_digit = |item: &Item| ((item.key - low) >> (shift + DIGIT_BITS)) as usize % DIGITS;
     let parts = if items.len() < PARALLEL_FROM { 1 } else { workers.count() };
     if parts > 1 {
         pass(workers, parts, items, spare, low_digit);
