@@ -117,6 +117,7 @@ fn every_command_has_help_with_an_example_and_the_configuration_is_printed_whole
         "doctor",
         "evaluate",
         "export",
+        "reconstruct",
         "config",
         "px4-link",
         "camera",
