@@ -305,6 +305,52 @@ mod tests {
         assert_eq!(reversed, scores);
     }
 
+    /// Views from four distances, from each place aimed at five points.
+    fn thousand() -> Vec<CandidateView> {
+        (0..1000u32)
+            .map(|k| {
+                let (place, aim) = (k / 5, f64::from(k % 5));
+                let (angle, radius) = (f64::from(place) * 0.7, 1.4 + 0.4 * f64::from(place % 4));
+                let eye = radius * DVec3::new(angle.cos(), angle.sin(), 0.3);
+                let pose = look_at(eye, 0.1 * DVec3::new(aim.cos(), aim.sin(), 0.0));
+                CandidateView { world_from_camera_xyzw: pose.rotation.to_array(), ..view(k, eye, 0) }
+            })
+            .collect()
+    }
+
+    #[test]
+    fn a_thousand_candidates_score_as_they_do_one_by_one() {
+        let (views, rows) = (thousand(), wall(0.0, 8.0));
+        let all = run(&request(), &views, &rows, 2);
+        assert_eq!(all.scores.len(), 1000);
+        for index in [0, 1, 499, 998, 999] {
+            let alone = run(&request(), &views[index..=index], &rows, 1).scores[0];
+            let among = all.scores[index];
+            assert_eq!(
+                (alone.index, alone.mean_variance_m2, alone.area_fraction, alone.mean_alpha),
+                (among.index, among.mean_variance_m2, among.area_fraction, among.mean_alpha)
+            );
+        }
+    }
+
+    #[test]
+    fn a_thousand_candidates_are_given_up_on_demand() {
+        let held = Held::new(5, true, &wall(0.0, 8.0));
+        let job = Job::from_request(&request(), &thousand(), 0.1).unwrap();
+        let mut engine = Engine::new(2).unwrap();
+        let (cancel, done) = (AtomicBool::new(false), AtomicU64::new(0));
+        std::thread::scope(|scope| {
+            scope.spawn(|| {
+                while done.load(Ordering::Relaxed) == 0 {
+                    std::thread::yield_now();
+                }
+                cancel.store(true, Ordering::Relaxed);
+            });
+            assert_eq!(job.run(&mut engine, &held.model, &cancel, &done), None);
+        });
+        assert!(done.into_inner() < 1000);
+    }
+
     #[test]
     fn broken_rows_are_left_out() {
         let mut rows = wall(0.0, 8.0);

@@ -92,9 +92,11 @@ pub(crate) fn block_gradient<S: Simd, const BANDS: bool, const OBSERVED: bool>(
     };
     for lane in 0..LANES {
         let (from, to) = (base + first[lane] as usize, base + first[lane + 1] as usize);
-        for ahead in 0..2 {
+        for ahead in 0..4 {
             if let Some(&next) = partials.places.get(from + AHEAD + ahead) {
-                prefetch(partials.sums.get(next as usize * MOMENTS));
+                let at = next as usize * MOMENTS;
+                prefetch(partials.sums.get(at));
+                prefetch(partials.sums.get(at + MOMENTS - 1));
             }
         }
         // Most splats touch one, two or four tiles: without a loop, whose end would be mispredicted.

@@ -1,6 +1,9 @@
 //! What this machine can do at best: its name, its peak of fused multiply-adds, its memory bandwidth.
 
-#![cfg_attr(target_arch = "x86_64", expect(unsafe_code, reason = "the peak of an instruction set needs its instructions"))]
+#![cfg_attr(
+    target_arch = "x86_64",
+    expect(unsafe_code, reason = "the peak of an instruction set needs its instructions")
+)]
 
 use std::hint::black_box;
 use std::sync::Barrier;

@@ -44,6 +44,22 @@ fn least(repetitions: usize, mut f: impl FnMut()) -> Least {
     })
 }
 
+/// Forgets the largest memory use so far, and with `None` where the system does not say, reads it.
+mod peak {
+    /// From here on the peak is counted anew.
+    pub fn forget() {
+        // Without permission the peak is that of the whole run, which is no less.
+        let _ = std::fs::write("/proc/self/clear_refs", "5");
+    }
+
+    /// Most memory resident since, megabytes.
+    pub fn megabytes() -> Option<f64> {
+        let status = std::fs::read_to_string("/proc/self/status").ok()?;
+        let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:"))?;
+        line.trim().strip_suffix("kB")?.trim().parse::<f64>().ok().map(|kb| kb / 1024.0)
+    }
+}
+
 struct Options {
     counts: Vec<usize>,
     only: Option<String>,
@@ -92,6 +108,7 @@ fn train(options: &Options, count: usize) -> Result<Row, Box<dyn std::error::Err
     let mut rendered = Rendered::default();
     single.render(&model, &camera, &RenderSettings::default(), &mut rendered);
     let view = scene::keyframe(camera, &rendered)?;
+    drop(rendered);
     let mut stages = [f64::INFINITY; STAGES.len()];
     least(options.repetitions, || {
         black_box(single.train_step(&mut model, &mut optimiser, &view, &still));
@@ -100,11 +117,14 @@ fn train(options: &Options, count: usize) -> Result<Row, Box<dyn std::error::Err
         }
     });
     let work = single.work();
+    drop(single);
+    peak::forget();
     let mut engine = Engine::new(options.threads)?;
     let times = least(options.repetitions, || {
         black_box(engine.train_step(&mut model, &mut optimiser, &view, &still));
     });
-    Ok(Row::new(&engine, "train", count, 1, times).with_stages(STAGES.iter().copied().zip(stages)).with_work(work))
+    let row = Row::new(&engine, "train", count, 1, times).with_memory(peak::megabytes());
+    Ok(row.with_stages(STAGES.iter().copied().zip(stages)).with_work(work))
 }
 
 /// Moments of many views in one request.

@@ -19,6 +19,9 @@ pub struct Row {
     cpu_ms: f64,
     /// Iterations or views per second, by processor time on as many cores as there are threads.
     per_s: f64,
+    /// Largest resident memory of the process while training, megabytes.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    memory_mb: Option<f64>,
     stages: serde_json::Map<String, serde_json::Value>,
     #[serde(skip)]
     counted: Option<Work>,
@@ -34,9 +37,15 @@ impl Row {
             wall_ms: times.wall_ms,
             cpu_ms: times.cpu_ms,
             per_s: 1e3 * (items * engine.threads()) as f64 / times.cpu_ms,
+            memory_mb: None,
             stages: serde_json::Map::new(),
             counted: None,
         }
+    }
+
+    pub fn with_memory(mut self, megabytes: Option<f64>) -> Self {
+        self.memory_mb = megabytes;
+        self
     }
 
     pub fn with_stages(mut self, stages: impl Iterator<Item = (&'static str, f64)>) -> Self {
@@ -95,6 +104,9 @@ pub fn print_row(machine: &Machine, row: &Row) {
                 aim / scale / seconds
             );
         }
+    }
+    if let Some(megabytes) = row.memory_mb {
+        println!("  {megabytes:.0} MB resident at most, everything included");
     }
     let work = row.counted.unwrap_or_default();
     if row.counted.is_some() {
