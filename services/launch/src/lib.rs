@@ -117,7 +117,10 @@ fn export_any(arguments: &cli::Export) -> anyhow::Result<Exit> {
     }
     match summary.views {
         0 => print(&format!("{}: {} Gaussians\n", out.display(), summary.gaussians)),
-        views => print(&format!("{}: {views} views, {} points\n", out.display(), summary.points)),
+        views => {
+            let masks = if summary.masks > 0 { " with masks of the object" } else { "" };
+            print(&format!("{}: {views} views{masks}, {} points\n", out.display(), summary.points))
+        }
     }
 }
 

@@ -9,7 +9,10 @@ use std::path::{Path, PathBuf};
 use glam::DVec3;
 use shared_types::folder::{FolderError, Keyframe, MissionFolder, write_atomic};
 use shared_types::frames::Intrinsics;
-use splatting::{RenderSettings, formats};
+use splatting::rgbd::{clip_box::ClipBox, masks};
+use splatting::{PixelClass, RenderSettings, formats};
+
+use crate::evaluate::views::camera_of;
 
 pub mod colmap;
 pub mod nerfstudio;
@@ -20,9 +23,9 @@ const POINTS_PER_VIEW: f64 = 2_000.0;
 /// What a mission can be exported as.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Format {
-    /// `images/` and `sparse/0/` with cameras, images and points3D, as text and as binary.
+    /// `images/`, `masks/` and `sparse/0/` with cameras, images and points3D, as text and as binary.
     Colmap,
-    /// `images/`, `depth/`, `points.ply` and `transforms.json`.
+    /// `images/`, `masks/`, `depth/`, `points.ply` and `transforms.json`.
     Nerfstudio,
     /// The final model as one file.
     Model(formats::Format),
@@ -35,6 +38,8 @@ pub struct Summary {
     pub views: usize,
     /// Points exported.
     pub points: usize,
+    /// Masks of the object exported.
+    pub masks: usize,
     /// Gaussians exported.
     pub gaussians: usize,
     /// Degree of the model's spherical harmonics, where the format has none above 0 and they were lost.
@@ -70,6 +75,17 @@ pub enum ExportError {
         path: PathBuf,
         /// What does not fit.
         source: formats::WriteError,
+    },
+    /// The box around the object could not be read.
+    #[error(transparent)]
+    Prior(#[from] reconstruct::error::DatasetError),
+    /// A mask cannot be encoded.
+    #[error("the mask of keyframe {id} cannot be encoded: {source}")]
+    Picture {
+        /// The keyframe.
+        id: u64,
+        /// The encoder's reason.
+        source: png::EncodingError,
     },
     /// A file whose name is that of no model.
     #[error(
@@ -119,6 +135,7 @@ pub fn export(folder: &MissionFolder, format: Format, out: &Path) -> Result<Summ
     }
     let mut views = Vec::new();
     let mut points = Vec::new();
+    let clip = reconstruct::dataset::mission::clip_box(folder)?;
     for id in folder.list_keyframes()? {
         let Some(keyframe) = folder.read_keyframe(id)? else { continue };
         points.extend(points_of(&keyframe));
@@ -128,6 +145,13 @@ pub fn export(folder: &MissionFolder, format: Format, out: &Path) -> Result<Summ
         if format == Format::Nerfstudio {
             write_atomic(&out.join("depth").join(&name), &read(&source.join("depth.png"))?)?;
         }
+        if let Some(clip) = &clip {
+            let size = (keyframe.frame.intrinsics.width, keyframe.frame.intrinsics.height);
+            let png =
+                gray_png(&mask_of(&keyframe, clip), size).map_err(|source| ExportError::Picture { id, source })?;
+            // COLMAP's name for the mask of an image, which nerfstudio is told.
+            write_atomic(&out.join("masks").join(format!("{name}.png")), &png)?;
+        }
         views.push(keyframe.frame);
     }
     if views.is_empty() {
@@ -136,10 +160,30 @@ pub fn export(folder: &MissionFolder, format: Format, out: &Path) -> Result<Summ
     }
     match format {
         Format::Colmap => colmap::write(out, &views, &points)?,
-        Format::Nerfstudio => nerfstudio::write(out, &views, &points)?,
+        Format::Nerfstudio => nerfstudio::write(out, &views, &points, clip.is_some())?,
         Format::Model(_) => {}
     }
-    Ok(Summary { views: views.len(), points: points.len(), ..Summary::default() })
+    let masks = if clip.is_some() { views.len() } else { 0 };
+    Ok(Summary { views: views.len(), points: points.len(), masks, ..Summary::default() })
+}
+
+/// White where a keyframe measured something inside of the object's box, as in training (A31).
+fn mask_of(keyframe: &Keyframe, clip: &ClipBox) -> Vec<u8> {
+    let camera = camera_of(&keyframe.frame.world_from_camera(), &keyframe.frame.intrinsics);
+    #[expect(clippy::cast_possible_truncation, reason = "metres fit f32 to a fraction of a millimetre")]
+    let depth_m: Vec<f32> =
+        keyframe.depth_units.iter().map(|&units| (f64::from(units) * keyframe.frame.depth_unit_m) as f32).collect();
+    let classes = masks::classify(&camera, &depth_m, clip);
+    classes.into_iter().map(|class| if class == PixelClass::Foreground { u8::MAX } else { 0 }).collect()
+}
+
+fn gray_png(pixels: &[u8], (width, height): (u32, u32)) -> Result<Vec<u8>, png::EncodingError> {
+    let mut bytes = Vec::new();
+    let mut encoder = png::Encoder::new(&mut bytes, width, height);
+    encoder.set_color(png::ColorType::Grayscale);
+    encoder.set_depth(png::BitDepth::Eight);
+    encoder.write_header()?.write_image_data(pixels)?;
+    Ok(bytes)
 }
 
 /// Writes a model file in another format; in its own format it is copied, once it has been read as whole.

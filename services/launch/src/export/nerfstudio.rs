@@ -19,24 +19,28 @@ pub fn world_from_gl_camera(view: &Frame) -> DMat4 {
     DMat4::from_rotation_translation(pose.rotation, pose.position_m) * DMat4::from_scale(DVec3::new(1.0, -1.0, -1.0))
 }
 
-/// Writes `transforms.json` and `points.ply` under `out`.
+/// Writes `transforms.json` and `points.ply` under `out`; with `masks`, it names one for each image.
 ///
 /// # Errors
 /// When a file cannot be written.
-pub fn write(out: &Path, views: &[Frame], points: &[Point]) -> Result<(), FolderError> {
+pub fn write(out: &Path, views: &[Frame], points: &[Point], masks: bool) -> Result<(), FolderError> {
     let frames: Vec<_> = views
         .iter()
         .map(|view| {
             let matrix = world_from_gl_camera(view);
             let rows: Vec<[f64; 4]> = (0..4).map(|row| matrix.row(row).to_array()).collect();
             let camera = view.intrinsics;
-            json!({
+            let mut frame = json!({
                 "file_path": format!("images/{:06}.png", view.id),
                 "depth_file_path": format!("depth/{:06}.png", view.id),
                 "transform_matrix": rows,
                 "w": camera.width, "h": camera.height,
                 "fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy,
-            })
+            });
+            if masks {
+                frame["mask_path"] = json!(format!("masks/{:06}.png.png", view.id));
+            }
+            frame
         })
         .collect();
     let depth_unit_m = views.first().map(|view| view.depth_unit_m);

@@ -74,6 +74,7 @@ fn colmap_projects_a_point_onto_the_same_pixel() {
     let summary = export(&folder, Format::Colmap, &out).expect("exported");
     assert_eq!(summary.views, 2);
     assert!(summary.points > 300, "{summary:?}");
+    assert_eq!(summary.masks, 0, "no box was found");
     let file = |name: &str| fs::read(out.join("sparse/0").join(name)).expect("file");
 
     let mut cameras = Bytes(file("cameras.bin"), 0);

@@ -106,6 +106,20 @@ fn a_mission_and_its_exports_give_the_same_cameras_and_images() {
         a.points.iter().zip(&b.points).map(|(p, q)| p.position.distance(q.position)).fold(0.0, f64::max)
     };
     assert!(colmap.points.len() > 100 && between(&colmap, &text) < 1e-9 && between(&colmap, &nerfstudio) < 1e-5);
+    // The exports' masks are what training on the mission makes of depth and box.
+    let masked = |root: &Path| {
+        let listing = dataset::list(root, None).expect("listed");
+        let options = LoadOptions { downscale: Some(1), mask: reconstruct::MaskUse::Auto, memory_bytes: 1 << 24 };
+        let images = dataset::load(&listing, &options).expect("loaded").images;
+        let counted = |image: dataset::Image| {
+            image.classes.expect("classes").iter().map(|&class| class == splatting::PixelClass::Foreground).collect()
+        };
+        images.into_iter().map(counted).collect::<Vec<Vec<bool>>>()
+    };
+    let expected = masked(folder.root());
+    assert!(expected.iter().flatten().any(|&object| object) && expected.iter().flatten().any(|&object| !object));
+    assert_eq!(masked(&dir.path().join("colmap")), expected);
+    assert_eq!(masked(&dir.path().join("nerfstudio")), expected);
     let stage = mission.stage.expect("the prior");
     assert!(
         (stage.clip.min.z - (-0.2 - 0.01 - 0.03)).abs() < 1e-6,

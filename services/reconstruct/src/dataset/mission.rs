@@ -13,16 +13,32 @@ use splatting::rgbd::clip_box::ClipBox;
 use super::{DepthFile, Entry, Format, Listing, Stage};
 use crate::error::DatasetError;
 
+/// The box that a mission found around its object; `None` where it has found none yet.
+///
+/// # Errors
+/// [`DatasetError`]: the configuration or the journal's prior is damaged.
+pub fn clip_box(folder: &MissionFolder) -> Result<Option<ClipBox>, DatasetError> {
+    let path = folder.journal_path();
+    if !path.is_file() || prior_of(&path)?.is_none() {
+        return Ok(None);
+    }
+    Ok(Some(stage_of(&path, &config_of(folder)?)?.clip))
+}
+
+fn config_of(folder: &MissionFolder) -> Result<Config, DatasetError> {
+    Ok(match folder.config_path() {
+        path if path.is_file() => load(&[Layer::of_file(&path)?])?,
+        _ => Config::default(),
+    })
+}
+
 /// Lists the keyframes of a mission.
 ///
 /// # Errors
 /// [`DatasetError`]: a file of the folder is damaged, or the mission never found its object.
 pub fn list(root: &Path) -> Result<Listing, DatasetError> {
     let folder = MissionFolder::open(root)?;
-    let config: Config = match folder.config_path() {
-        path if path.is_file() => load(&[Layer::of_file(&path)?])?,
-        _ => Config::default(),
-    };
+    let config = config_of(&folder)?;
     let mut entries = Vec::new();
     for id in folder.list_keyframes()? {
         let Some(frame) = folder.read_frame(KeyframeReason::Selected, id)? else { continue };
@@ -56,8 +72,8 @@ pub fn list(root: &Path) -> Result<Listing, DatasetError> {
     })
 }
 
-/// The prior, as the journal has it. A mission may look for its object again; the last word counts.
-fn stage_of(path: &Path, config: &Config) -> Result<Stage, DatasetError> {
+/// Line and entry of the prior in a journal. A mission may look for its object again; the last word counts.
+fn prior_of(path: &Path) -> Result<Option<(usize, Value)>, DatasetError> {
     let bytes = std::fs::read(path)
         .map_err(|source| DatasetError::read(path, source, "it holds the box that the mission found"))?;
     let mut found = None;
@@ -68,7 +84,11 @@ fn stage_of(path: &Path, config: &Config) -> Result<Stage, DatasetError> {
             found = Some((index + 1, entry));
         }
     }
-    let Some((line, entry)) = found else {
+    Ok(found)
+}
+
+fn stage_of(path: &Path, config: &Config) -> Result<Stage, DatasetError> {
+    let Some((line, entry)) = prior_of(path)? else {
         let expected = "a line with the event \"prior\": the mission never found its object; resume it first";
         return Err(DatasetError::damaged(path, "the journal", "without a prior", expected));
     };
