@@ -374,7 +374,8 @@ mod tests {
     fn the_examples_parse() {
         for command in Cli::command().get_subcommands() {
             let help = command.get_after_help().map(ToString::to_string).unwrap_or_default();
-            let line = help.trim_start_matches("Example: ").split(" > ").next().unwrap_or_default().to_owned();
+            let first = help.lines().next().unwrap_or_default();
+            let line = first.trim_start_matches("Example: ").split(" > ").next().unwrap_or_default().to_owned();
             assert!(Cli::try_parse_from(line.split_whitespace()).is_ok(), "{line}");
         }
     }
