@@ -50,7 +50,9 @@ impl Engine {
         view: &TrainingView,
         settings: &TrainingSettings,
     ) -> LossTerms {
-        self.step::<false>(gaussians, optimiser, view, settings, &mut ScreenStatistics::new())
+        self.on_workers(|engine| {
+            engine.step::<false>(gaussians, optimiser, view, settings, &mut ScreenStatistics::new())
+        })
     }
 
     /// The same step, bit for bit, which also adds what it saw of each Gaussian to `statistics`, for densification.
@@ -63,7 +65,15 @@ impl Engine {
         statistics: &mut ScreenStatistics,
     ) -> LossTerms {
         statistics.fit(gaussians);
-        self.step::<true>(gaussians, optimiser, view, settings, statistics)
+        self.on_workers(|engine| engine.step::<true>(gaussians, optimiser, view, settings, statistics))
+    }
+
+    /// Runs `f` on a worker, so that its dozen stages need no thread outside to be woken.
+    fn on_workers<R: Send>(&mut self, f: impl FnOnce(&mut Self) -> R + Send) -> R {
+        match self.workers.pool() {
+            Some(pool) => pool.install(|| f(self)),
+            None => f(self),
+        }
     }
 
     /// A step; with `OBSERVED` the statistics have the length of the model, else they are not touched.

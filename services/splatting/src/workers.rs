@@ -8,14 +8,14 @@
 
 use std::marker::PhantomData;
 use std::ops::Range;
-use std::sync::Mutex;
 use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex};
 
 use rayon::ThreadPool;
 
 /// A fixed set of worker threads, or none: then the caller's thread does the work.
 pub(crate) struct Workers {
-    pool: Option<ThreadPool>,
+    pool: Option<Arc<ThreadPool>>,
 }
 
 impl Workers {
@@ -26,7 +26,7 @@ impl Workers {
         }
         let pool =
             rayon::ThreadPoolBuilder::new().num_threads(threads).thread_name(|i| format!("splatting-{i}")).build()?;
-        Ok(Self { pool: Some(pool) })
+        Ok(Self { pool: Some(Arc::new(pool)) })
     }
 
     /// Everything on the caller's thread.
@@ -36,7 +36,13 @@ impl Workers {
 
     /// Number of workers.
     pub(crate) fn count(&self) -> usize {
-        self.pool.as_ref().map_or(1, ThreadPool::current_num_threads)
+        self.pool.as_ref().map_or(1, |pool| pool.current_num_threads())
+    }
+
+    /// The pool, for a caller that has many stages to run: inside of it (`ThreadPool::install`) a worker begins each stage
+    /// itself, while a thread outside would have to wake one and be woken again each time.
+    pub(crate) fn pool(&self) -> Option<Arc<ThreadPool>> {
+        self.pool.clone()
     }
 
     /// Runs `task(worker, index)` for every index below `tasks`; returns when all are done.
