@@ -165,7 +165,7 @@ pub enum ReconstructError {
         what: String,
         /// In the folder.
         found: String,
-        /// As asked for now.
+        /// In the command that was given.
         wanted: String,
     },
     /// Another process trains into the output folder.

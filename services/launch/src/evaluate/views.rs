@@ -74,13 +74,7 @@ pub fn appearance(truth: &Truth, gaussians: &Gaussians, views: &[TrueView], effo
 /// A camera of the splatting library.
 #[must_use]
 pub fn camera_of(world_from_camera: &Pose, intrinsics: &Intrinsics) -> Camera {
-    #[expect(clippy::cast_possible_truncation, reason = "the renderer works in f32")]
-    let [fx, fy, cx, cy] = [intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy].map(|value| value as f32);
-    let world_from_camera = splatting::Pose {
-        rotation: world_from_camera.rotation.as_quat(),
-        translation: world_from_camera.position_m.as_vec3(),
-    };
-    Camera { world_from_camera, fx, fy, cx, cy, width: intrinsics.width, height: intrinsics.height }
+    reconstruct::dataset::camera_of(world_from_camera, intrinsics, 1)
 }
 
 /// Figures of one view.

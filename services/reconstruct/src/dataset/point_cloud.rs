@@ -3,65 +3,10 @@
 use std::path::Path;
 
 use glam::DVec3;
-use splatting::bytes::{Reader, Truncated};
+use splatting::formats::ply::Scalar;
 
 use super::Point;
 use crate::error::DatasetError;
-
-/// A scalar type of PLY.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Scalar {
-    I8,
-    U8,
-    I16,
-    U16,
-    I32,
-    U32,
-    F32,
-    F64,
-}
-
-impl Scalar {
-    fn of(name: &str) -> Option<Self> {
-        Some(match name {
-            "char" | "int8" => Self::I8,
-            "uchar" | "uint8" => Self::U8,
-            "short" | "int16" => Self::I16,
-            "ushort" | "uint16" => Self::U16,
-            "int" | "int32" => Self::I32,
-            "uint" | "uint32" => Self::U32,
-            "float" | "float32" => Self::F32,
-            "double" | "float64" => Self::F64,
-            _ => return None,
-        })
-    }
-
-    fn bytes(self) -> usize {
-        match self {
-            Self::I8 | Self::U8 => 1,
-            Self::I16 | Self::U16 => 2,
-            Self::I32 | Self::U32 | Self::F32 => 4,
-            Self::F64 => 8,
-        }
-    }
-
-    fn read(self, reader: &mut Reader<'_>) -> Result<f64, Truncated> {
-        const WHAT: &str = "a vertex";
-        Ok(match self {
-            Self::I8 => f64::from(reader.bytes(1, WHAT)?[0].cast_signed()),
-            Self::U8 => f64::from(reader.bytes(1, WHAT)?[0]),
-            Self::I16 | Self::U16 => {
-                let pair = reader.bytes(2, WHAT)?;
-                let value = u16::from_le_bytes([pair[0], pair[1]]);
-                if self == Self::U16 { f64::from(value) } else { f64::from(value.cast_signed()) }
-            }
-            Self::I32 => f64::from(reader.i32(WHAT)?),
-            Self::U32 => f64::from(reader.u32(WHAT)?),
-            Self::F32 => f64::from(reader.f32(WHAT)?),
-            Self::F64 => reader.f64(WHAT)?,
-        })
-    }
-}
 
 /// The vertex element of a header.
 struct Header {
@@ -117,13 +62,14 @@ pub fn read(path: &Path) -> Result<Vec<Point>, DatasetError> {
             points.push(point(path, &values, places)?);
         }
     } else {
-        let mut reader = Reader::new(body);
+        let mut rest = body;
         for index in 0..header.vertices {
             for (value, (_, kind)) in values.iter_mut().zip(&header.properties) {
-                *value = kind.read(&mut reader).map_err(|_cut| {
+                *value = kind.value(rest).ok_or_else(|| {
                     let found = format!("cut off after {index} points");
                     DatasetError::damaged(path, "element vertex", found, header.vertices.to_string())
                 })?;
+                rest = rest.get(kind.bytes()..).unwrap_or_default();
             }
             points.push(point(path, &values, places)?);
         }
@@ -180,7 +126,7 @@ fn header(path: &Path, bytes: &[u8]) -> Result<Header, DatasetError> {
                 }
                 in_vertex = false;
             }
-            ["property", kind, name] if in_vertex => match Scalar::of(kind) {
+            ["property", kind, name] if in_vertex => match Scalar::named(kind) {
                 Some(kind) => header.properties.push((name.to_owned(), kind)),
                 None => return wrong(header.lines, "property", kind, "a scalar type of PLY"),
             },

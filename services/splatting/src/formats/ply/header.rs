@@ -5,21 +5,31 @@ use super::PlyError;
 /// A header longer than this is not one.
 pub const HEADER_MAX: usize = 64 << 10;
 
-/// Type of a property.
+/// Scalar type of a PLY property.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Scalar {
+    /// `char`
     I8,
+    /// `uchar`
     U8,
+    /// `short`
     I16,
+    /// `ushort`
     U16,
+    /// `int`
     I32,
+    /// `uint`
     U32,
+    /// `float`
     F32,
+    /// `double`
     F64,
 }
 
 impl Scalar {
-    fn named(name: &str) -> Option<Self> {
+    /// The type of this name: `char` to `double`, or `int8` to `float64`.
+    #[must_use]
+    pub fn named(name: &str) -> Option<Self> {
         Some(match name {
             "char" | "int8" => Self::I8,
             "uchar" | "uint8" => Self::U8,
@@ -33,13 +43,33 @@ impl Scalar {
         })
     }
 
-    const fn bytes(self) -> usize {
+    /// Bytes of a value in a binary file.
+    #[must_use]
+    pub const fn bytes(self) -> usize {
         match self {
             Self::I8 | Self::U8 => 1,
             Self::I16 | Self::U16 => 2,
             Self::I32 | Self::U32 | Self::F32 => 4,
             Self::F64 => 8,
         }
+    }
+
+    /// The value at the beginning of these bytes, little-endian; `None` where they are too few.
+    #[must_use]
+    pub fn value(self, bytes: &[u8]) -> Option<f64> {
+        fn first<const N: usize>(bytes: &[u8]) -> Option<[u8; N]> {
+            bytes.first_chunk().copied()
+        }
+        Some(match self {
+            Self::I8 => f64::from(i8::from_le_bytes(first(bytes)?)),
+            Self::U8 => f64::from(u8::from_le_bytes(first(bytes)?)),
+            Self::I16 => f64::from(i16::from_le_bytes(first(bytes)?)),
+            Self::U16 => f64::from(u16::from_le_bytes(first(bytes)?)),
+            Self::I32 => f64::from(i32::from_le_bytes(first(bytes)?)),
+            Self::U32 => f64::from(u32::from_le_bytes(first(bytes)?)),
+            Self::F32 => f64::from(f32::from_le_bytes(first(bytes)?)),
+            Self::F64 => f64::from_le_bytes(first(bytes)?),
+        })
     }
 }
 
@@ -54,21 +84,7 @@ pub struct Property {
 impl Property {
     /// Its value in a row; not a number where the row is too short.
     pub fn value(&self, row: &[u8]) -> f32 {
-        fn bytes<const N: usize>(row: &[u8], at: usize) -> Option<[u8; N]> {
-            row.get(at..)?.first_chunk().copied()
-        }
-        let at = self.offset;
-        let value = match self.scalar {
-            Scalar::I8 => bytes(row, at).map(|b| f32::from(i8::from_le_bytes(b))),
-            Scalar::U8 => bytes(row, at).map(|b| f32::from(u8::from_le_bytes(b))),
-            Scalar::I16 => bytes(row, at).map(|b| f32::from(i16::from_le_bytes(b))),
-            Scalar::U16 => bytes(row, at).map(|b| f32::from(u16::from_le_bytes(b))),
-            Scalar::I32 => bytes(row, at).map(|b| i32::from_le_bytes(b) as f32),
-            Scalar::U32 => bytes(row, at).map(|b| u32::from_le_bytes(b) as f32),
-            Scalar::F32 => bytes(row, at).map(f32::from_le_bytes),
-            Scalar::F64 => bytes(row, at).map(|b| f64::from_le_bytes(b) as f32),
-        };
-        value.unwrap_or(f32::NAN)
+        row.get(self.offset..).and_then(|bytes| self.scalar.value(bytes)).map_or(f32::NAN, |value| value as f32)
     }
 }
 

@@ -17,6 +17,7 @@ use std::io::{self, Write};
 use glam::{Quat, Vec3};
 use thiserror::Error;
 
+pub use self::header::Scalar;
 use self::header::{HEADER_MAX, Property};
 use super::{check_finite, degree_of_rest};
 use crate::model::{Gaussian, Gaussians, SH_REST_MAX, sh_rest_coefficients};
