@@ -16,7 +16,9 @@ use std::time::Instant;
 use glam::Vec3;
 use machine::Machine;
 use report::Row;
-use splatting::{Engine, Gaussians, MomentsView, Optimiser, RenderSettings, Rendered, TrainingSettings};
+use splatting::{
+    Engine, Gaussians, MomentsView, Optimiser, RenderSettings, Rendered, TrainingSettings, TrainingView, Work,
+};
 
 /// Names of [`Engine::stage_times`].
 const STAGES: [&str; 7] = ["project", "sort", "bin", "blend", "loss", "backward", "adam"];
@@ -90,25 +92,42 @@ impl Options {
     }
 }
 
-/// A training iteration: stages on one thread, the whole on all threads.
-fn train(options: &Options, count: usize) -> Result<Row, Box<dyn std::error::Error>> {
-    let mut model = scene::model(count);
-    let camera = scene::camera(0, 1, 2.0, Vec3::ZERO);
-    // Learning rates that leave the scene as it is, so that every repetition does the same work.
-    let still = TrainingSettings {
+/// Learning rates that leave the scene as it is, so that every repetition does the same work.
+fn still() -> TrainingSettings {
+    TrainingSettings {
         lr_means: 1e-9,
         lr_log_scales: 1e-9,
         lr_rotations: 1e-9,
         lr_opacity: 1e-9,
         lr_sh: 1e-9,
         ..TrainingSettings::default()
-    };
+    }
+}
+
+/// The scene's model, and a keyframe of it.
+fn subject(engine: &mut Engine, count: usize) -> Result<(Gaussians, TrainingView), Box<dyn std::error::Error>> {
+    let model = scene::model(count);
+    let camera = scene::camera(0, 1, 2.0, Vec3::ZERO);
+    let mut rendered = Rendered::default();
+    engine.render(&model, &camera, &RenderSettings::default(), &mut rendered);
+    let view = scene::keyframe(camera, &rendered)?;
+    Ok((model, view))
+}
+
+/// What an iteration on the scene has to do.
+fn scene_work(count: usize) -> Result<Work, Box<dyn std::error::Error>> {
+    let mut engine = Engine::new(1)?;
+    let (mut model, view) = subject(&mut engine, count)?;
+    engine.train_step(&mut model, &mut Optimiser::new(), &view, &still());
+    Ok(engine.work())
+}
+
+/// A training iteration: stages on one thread, the whole on all threads.
+fn train(options: &Options, count: usize) -> Result<Row, Box<dyn std::error::Error>> {
+    let still = still();
     let mut optimiser = Optimiser::new();
     let mut single = Engine::new(1)?;
-    let mut rendered = Rendered::default();
-    single.render(&model, &camera, &RenderSettings::default(), &mut rendered);
-    let view = scene::keyframe(camera, &rendered)?;
-    drop(rendered);
+    let (mut model, view) = subject(&mut single, count)?;
     let mut stages = [f64::INFINITY; STAGES.len()];
     least(options.repetitions, || {
         black_box(single.train_step(&mut model, &mut optimiser, &view, &still));
@@ -123,8 +142,8 @@ fn train(options: &Options, count: usize) -> Result<Row, Box<dyn std::error::Err
     let times = least(options.repetitions, || {
         black_box(engine.train_step(&mut model, &mut optimiser, &view, &still));
     });
-    let row = Row::new(&engine, "train", count, 1, times).with_memory(peak::megabytes());
-    Ok(row.with_stages(STAGES.iter().copied().zip(stages)).with_work(work))
+    let row = Row::new(&engine, "train", work, 1, times).with_memory(peak::megabytes());
+    Ok(row.with_stages(STAGES.iter().copied().zip(stages)))
 }
 
 /// Moments of many views in one request.
@@ -155,7 +174,7 @@ fn score(options: &Options, work: &'static str, count: usize) -> Result<Row, Box
     });
     match failure {
         Some(error) => Err(error.into()),
-        None => Ok(Row::new(&engine, work, count, views.len(), times)),
+        None => Ok(Row::new(&engine, work, scene_work(count)?, views.len(), times)),
     }
 }
 

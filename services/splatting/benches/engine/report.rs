@@ -6,7 +6,7 @@ use serde::Serialize;
 use splatting::{Engine, Work};
 
 use crate::Least;
-use crate::machine::{Machine, REFERENCE_FMA_GFLOPS};
+use crate::machine::{Machine, REFERENCE};
 
 /// One measured piece of work.
 #[derive(Serialize)]
@@ -23,23 +23,24 @@ pub struct Row {
     #[serde(skip_serializing_if = "Option::is_none")]
     memory_mb: Option<f64>,
     stages: serde_json::Map<String, serde_json::Value>,
+    /// What an iteration on this scene has to do.
     #[serde(skip)]
-    counted: Option<Work>,
+    counted: Work,
 }
 
 impl Row {
-    pub fn new(engine: &Engine, work: &'static str, gaussians: usize, items: usize, times: Least) -> Self {
+    pub fn new(engine: &Engine, work: &'static str, counted: Work, items: usize, times: Least) -> Self {
         Self {
             backend: format!("cpu-{:?}", engine.isa()).to_lowercase(),
             work,
-            gaussians,
+            gaussians: counted.gaussians,
             threads: engine.threads(),
             wall_ms: times.wall_ms,
             cpu_ms: times.cpu_ms,
             per_s: 1e3 * (items * engine.threads()) as f64 / times.cpu_ms,
             memory_mb: None,
             stages: serde_json::Map::new(),
-            counted: None,
+            counted,
         }
     }
 
@@ -50,11 +51,6 @@ impl Row {
 
     pub fn with_stages(mut self, stages: impl Iterator<Item = (&'static str, f64)>) -> Self {
         self.stages.extend(stages.map(|(name, ms)| (name.to_owned(), ms.into())));
-        self
-    }
-
-    pub fn with_work(mut self, work: Work) -> Self {
-        self.counted = Some(work);
         self
     }
 
@@ -71,45 +67,67 @@ impl Row {
             _ => return None,
         })
     }
+
+    /// Least time of an item on so many cores of a machine, milliseconds: each stage at the peak of multiply-adds or at
+    /// the memory's bandwidth, whichever takes longer.
+    fn floor_ms(&self, machine: &Machine) -> f64 {
+        let stages: &[&str] = match self.work {
+            "train" => &crate::STAGES,
+            _ => &["project", "sort", "bin", "blend"],
+        };
+        let seconds = |stage: &&str| {
+            let (flops, bytes) = floor(stage, self.counted);
+            let compute = flops / (machine.fma_gflops_per_core * self.threads as f64 * 1e9);
+            compute.max(bytes / (machine.bandwidth_gb_s * 1e9))
+        };
+        1e3 * stages.iter().map(seconds).sum::<f64>()
+    }
+
+    /// How many times the reference machine's floor this machine's is.
+    fn scale(&self, machine: &Machine) -> f64 {
+        self.floor_ms(machine) / self.floor_ms(&REFERENCE.with_cores(self.threads))
+    }
 }
 
 pub fn print_machine(machine: &Machine) {
     println!("{}", machine.cpu);
     println!(
-        "peak {:.0} GFLOP/s per core, {:.1} GB/s; figures to reach are set for {REFERENCE_FMA_GFLOPS:.0} GFLOP/s per core",
-        machine.fma_gflops_per_core, machine.bandwidth_gb_s
+        "peak {:.0} GFLOP/s per core, {:.1} GB/s; figures to reach are set for {:.0} GFLOP/s per core, {:.1} GB/s",
+        machine.fma_gflops_per_core, machine.bandwidth_gb_s, REFERENCE.fma_gflops_per_core, REFERENCE.bandwidth_gb_s
     );
 }
 
 pub fn print_row(machine: &Machine, row: &Row) {
     println!("\n{} {} Gaussians, {}, {} threads", row.work, row.gaussians, row.backend, row.threads);
     println!("  {:8.2} ms processor, {:8.2} ms wall, {:.1} per s", row.cpu_ms, row.wall_ms, row.per_s);
-    let scale = machine.fma_gflops_per_core / REFERENCE_FMA_GFLOPS;
     if let Some((least, aim)) = row.goal() {
-        if row.work == "train" {
-            println!(
-                "  to reach {least:.0}/s, here {:.0}: {:.2}; aim {aim:.0}/s, here {:.0}: {:.2}",
-                least * scale,
-                row.per_s / (least * scale),
-                aim * scale,
-                row.per_s / (aim * scale)
-            );
-        } else {
-            let seconds = row.cpu_ms / 1e3 / row.threads as f64;
-            println!(
-                "  {seconds:.2} s; to reach {least:.2} s, here {:.2}: {:.2}; aim {aim:.2} s, here {:.2}: {:.2}",
-                least / scale,
-                least / scale / seconds,
-                aim / scale,
-                aim / scale / seconds
-            );
-        }
+        // A slower floor lowers rates and raises times in the same proportion.
+        let scale = row.scale(machine);
+        let (found, factor, unit) = match row.work {
+            "train" => (row.per_s, 1.0 / scale, "/s"),
+            _ => (row.cpu_ms / 1e3 / row.threads as f64, scale, " s"),
+        };
+        let reached = |goal: f64| if row.work == "train" { found / goal } else { goal / found };
+        println!(
+            "  {found:.3}{unit}; to reach {least}{unit}: {:.2}, by this machine's floor {:.2}{unit}: {:.2}; aim {aim}{unit}: {:.2}, by the floor {:.2}{unit}: {:.2}",
+            reached(least),
+            least * factor,
+            reached(least * factor),
+            reached(aim),
+            aim * factor,
+            reached(aim * factor),
+        );
     }
     if let Some(megabytes) = row.memory_mb {
         println!("  {megabytes:.0} MB resident at most, everything included");
     }
-    let work = row.counted.unwrap_or_default();
-    if row.counted.is_some() {
+    let work = row.counted;
+    if !row.stages.is_empty() {
+        println!(
+            "  floor {:.2} ms here, {:.2} ms on the reference machine",
+            row.floor_ms(machine),
+            row.floor_ms(&REFERENCE.with_cores(row.threads))
+        );
         println!(
             "  {} visible, {} (tile, splat) pairs, {} (4x4 block, splat) pairs",
             work.visible, work.entries, work.contributions
