@@ -16,6 +16,7 @@ mod densify;
 mod engine;
 pub mod formats;
 mod frame;
+pub mod gpu;
 mod gradient;
 mod initial;
 mod loss;

@@ -68,6 +68,21 @@ impl View {
         }
     }
 
+    /// Limits of x/z and y/z for the Jacobian: low x, high x, low y, high y.
+    pub(crate) fn limits(&self) -> [f32; 4] {
+        self.limits
+    }
+
+    /// Least alpha that counts.
+    pub(crate) fn alpha_min(&self) -> f32 {
+        self.alpha_min
+    }
+
+    /// Least depth that is drawn, metres.
+    pub(crate) fn near(&self) -> f32 {
+        self.near
+    }
+
     /// Variance added to both axes of the screen, px².
     pub(crate) fn low_pass(&self) -> f32 {
         self.low_pass

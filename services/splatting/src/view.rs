@@ -1,5 +1,7 @@
 //! A keyframe as the loss wants it: tiled target colours, depth, and which pixels count for what (A31).
 
+use std::sync::atomic::{AtomicU64, Ordering};
+
 use thiserror::Error;
 
 use crate::camera::Camera;
@@ -63,6 +65,7 @@ pub(crate) struct TargetTile {
 /// A keyframe prepared for training. About 17 bytes a pixel; nothing of it changes during training.
 #[derive(Clone)]
 pub struct TrainingView {
+    id: u64,
     camera: Camera,
     pub(crate) tiles: Vec<TargetTile>,
     pub(crate) foreground: usize,
@@ -92,8 +95,10 @@ impl TrainingView {
             return Err(ViewError::Color { x: bad % width, y: bad / width });
         }
         let (tiles_x, tiles_y) = (width.div_ceil(TILE), height.div_ceil(TILE));
+        static NEXT: AtomicU64 = AtomicU64::new(0);
+        let id = NEXT.fetch_add(1, Ordering::Relaxed);
         let mut view =
-            Self { camera, tiles: Vec::with_capacity(tiles_x * tiles_y), foreground: 0, free: 0, with_depth: 0 };
+            Self { id, camera, tiles: Vec::with_capacity(tiles_x * tiles_y), foreground: 0, free: 0, with_depth: 0 };
         for ty in 0..tiles_y {
             for tx in 0..tiles_x {
                 let mut tile = TargetTile {
@@ -141,6 +146,11 @@ impl TrainingView {
     /// As [`TrainingView::new`].
     pub fn full_image(camera: Camera, color: &[[f32; 3]], depth_m: &[f32]) -> Result<Self, ViewError> {
         Self::new(camera, color, depth_m, &vec![PixelClass::Foreground; color.len()])
+    }
+
+    /// Tells views apart, in this process: the GPU keeps what it has of each.
+    pub(crate) fn id(&self) -> u64 {
+        self.id
     }
 
     /// The keyframe's camera.

@@ -43,14 +43,14 @@ fn difference(a: Values, b: Values) -> f64 {
 }
 
 /// Difference of every pixel to the reference.
-fn errors(rendered: &Rendered, expected: &[Pixel], background: Vec3) -> Vec<f64> {
+pub(crate) fn errors(rendered: &Rendered, expected: &[Pixel], background: Vec3) -> Vec<f64> {
     let error = |(i, pixel)| difference(rendered_values(rendered, i), reference_values(pixel, background));
     expected.iter().enumerate().map(error).collect()
 }
 
 /// The bar of an image: errors within the tolerance, but for at most 0.1 % of the pixels, which must lie at a cut by the
 /// reference, and there within 1/255.
-fn assert_within(errors: &[f64], expected: &[Pixel], tolerance: f64, context: &str) {
+pub(crate) fn assert_within(errors: &[f64], expected: &[Pixel], tolerance: f64, context: &str) {
     let beyond: Vec<usize> = (0..errors.len()).filter(|&i| errors[i] > tolerance).collect();
     for &i in &beyond {
         assert!(expected[i].at_cut, "{context}: error {} at pixel {i}, which is not at a cut", errors[i]);

@@ -7,21 +7,21 @@ use super::harmonics::scene_of_degree;
 use super::{camera, isas, random_view, scene};
 use crate::model::sh_rest_rows;
 use crate::reference::{self, Parameters};
-use crate::{Camera, Engine, Gaussian, Gaussians, Optimiser, RenderSettings, TrainingSettings, TrainingView};
+use crate::{Camera, Engine, Gaussian, Gaussians, Gradient, Optimiser, RenderSettings, TrainingSettings, TrainingView};
 
 /// Parameters of a class, as indices into [`Parameters`].
-type Class = (&'static str, std::ops::Range<usize>);
+pub(crate) type Class = (&'static str, std::ops::Range<usize>);
 
 const GEOMETRY: [Class; 4] = [("means", 0..3), ("log scales", 3..6), ("rotations", 6..10), ("opacity", 10..11)];
 
 /// The classes that a loss of colour has a gradient of, for a degree.
-fn classes(degree: u8) -> Vec<Class> {
+pub(crate) fn classes(degree: u8) -> Vec<Class> {
     let bands = [("SH 0", 11..14), ("SH 1", 14..23), ("SH 2", 23..38), ("SH 3", 38..59)];
     GEOMETRY.into_iter().chain(bands.into_iter().take(usize::from(degree) + 1)).collect()
 }
 
 /// Cosine between two gradients of one class, and the ratio of their lengths. 0, 0 where the second is 0.
-fn compare(got: &[Parameters], want: &[Parameters], (_, range): &Class) -> (f64, f64) {
+pub(crate) fn compare(got: &[Parameters], want: &[Parameters], (_, range): &Class) -> (f64, f64) {
     let (mut dot, mut got2, mut want2) = (0.0, 0.0, 0.0);
     for (got, want) in got.iter().zip(want) {
         for (got, want) in got[range.clone()].iter().zip(&want[range.clone()]) {
@@ -38,7 +38,11 @@ fn engine_gradient(
     view: &TrainingView,
     s: &TrainingSettings,
 ) -> Vec<Parameters> {
-    let (_, gradient) = engine.gradient(model, view, s);
+    flat(&engine.gradient(model, view, s).1)
+}
+
+/// A gradient in the order of the reference's.
+pub(crate) fn flat(gradient: &Gradient) -> Vec<Parameters> {
     let all = gradient.parameters.iter().zip(&gradient.sh_rest);
     all.map(|(parameters, rest)| {
         let mut values = parameters.iter().chain(rest.iter().flatten());

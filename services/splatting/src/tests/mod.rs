@@ -3,9 +3,9 @@
 mod densify;
 mod densify_training;
 mod edges;
-mod forward;
-mod gradients;
-mod harmonics;
+pub(crate) mod forward;
+pub(crate) mod gradients;
+pub(crate) mod harmonics;
 mod hostile;
 mod mcmc;
 mod statistics;

@@ -1,0 +1,200 @@
+//! The chain of kernels from Gaussians to the lists of splats per tile, for one view or for many at once.
+
+use bytemuck::bytes_of;
+use wgpu::util::DeviceExt;
+use wgpu::{BindGroup, Buffer, BufferUsages, ComputePass};
+
+use super::buffers::Bytes;
+use super::context::Context;
+use super::error::GpuError;
+use super::job::{CONTROL_WORDS, Job, VIEW_BYTES, VIEWS_MAX, fold};
+use super::kernels::{Kernel, Kernels};
+use super::model::DeviceModel;
+use crate::frame::TILE;
+
+/// Side of the largest image, pixels: a box of tiles has a byte for each of its sides.
+const SIDE_MAX: u32 = 4096;
+/// Most workgroups that share the sort of a view, and its binning: enough for the largest GPUs.
+const SORT_GROUPS_MAX: u32 = 128;
+const BIN_GROUPS_MAX: u32 = 64;
+/// Bits that a pass of the sort takes, and all bits of a depth.
+const PASSES: [u32; 4] = [0, 8, 16, 24];
+
+/// What a chain has room for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct Size {
+    pub gaussians: u32,
+    pub views: u32,
+    pub width: u32,
+    pub height: u32,
+    /// (tile, splat) pairs of each view.
+    pub capacity: u32,
+}
+
+impl Size {
+    pub fn tiles_x(&self) -> u32 {
+        self.width.div_ceil(TILE as u32)
+    }
+
+    pub fn tiles_y(&self) -> u32 {
+        self.height.div_ceil(TILE as u32)
+    }
+
+    pub fn tiles(&self) -> u32 {
+        self.tiles_x() * self.tiles_y()
+    }
+
+    pub fn pixels(&self) -> u64 {
+        u64::from(self.width) * u64::from(self.height)
+    }
+
+    pub fn parameter_groups(&self) -> u32 {
+        self.gaussians.div_ceil(256).max(1)
+    }
+
+    /// Bytes of the largest buffers that each view needs.
+    pub fn bytes_per_view(&self) -> [u64; 3] {
+        [48 * u64::from(self.gaussians), 4 * u64::from(self.capacity), 12 * self.pixels()]
+    }
+
+    /// A first guess of the pairs of a view.
+    pub fn likely_pairs(gaussians: u32) -> u32 {
+        gaussians.saturating_mul(2).saturating_add(4096)
+    }
+
+    /// The job of this size, without settings.
+    pub fn job(&self) -> Job {
+        Job {
+            gaussians: self.gaussians,
+            sort_groups: self.gaussians.div_ceil(1024).clamp(1, SORT_GROUPS_MAX),
+            bin_groups: self.gaussians.div_ceil(2048).clamp(1, BIN_GROUPS_MAX),
+            capacity: self.capacity,
+            width: self.width,
+            height: self.height,
+            tiles_x: self.tiles_x(),
+            tiles_y: self.tiles_y(),
+            parameter_groups: self.parameter_groups(),
+            ..Job::default()
+        }
+    }
+}
+
+/// Buffers and bindings of a chain.
+pub(super) struct Chain {
+    pub size: Size,
+    pub rows: Buffer,
+    pub entries: Buffer,
+    pub starts: Buffer,
+    pub control: Buffer,
+    pub bytes: Bytes,
+    project: BindGroup,
+    sort: [(BindGroup, BindGroup, BindGroup); 4],
+    bin: [BindGroup; 3],
+}
+
+impl Chain {
+    /// `views` is the buffer of views, `jobs` that of jobs.
+    pub fn new(
+        context: &Context,
+        kernels: &Kernels,
+        model: &DeviceModel,
+        size: Size,
+        (jobs, views): (&Buffer, &Buffer),
+    ) -> Result<Self, GpuError> {
+        if size.width > SIDE_MAX || size.height > SIDE_MAX {
+            return Err(GpuError::TooManyPixels { width: size.width, height: size.height });
+        }
+        debug_assert!(size.views <= VIEWS_MAX);
+        let job = size.job();
+        let (gaussians, count, tiles) = (u64::from(size.gaussians), u64::from(size.views), u64::from(size.tiles()));
+        let mut bytes = Bytes::default();
+        let mut storage = |what: &'static str, length: u64| -> Result<Buffer, GpuError> {
+            let buffer = context.storage(what, length)?;
+            bytes.add(what, &buffer);
+            Ok(buffer)
+        };
+        let rows = storage("projected splats", 48 * gaussians * count)?;
+        let boxes = storage("boxes of tiles", 4 * gaussians * count)?;
+        let keys = [storage("sort", 4 * gaussians * count)?, storage("sort", 4 * gaussians * count)?];
+        let order = [storage("sort", 4 * gaussians * count)?, storage("sort", 4 * gaussians * count)?];
+        let counts = storage("sort", 1024 * u64::from(job.sort_groups) * count)?;
+        let table = storage("tile lists", 4 * u64::from(job.bin_groups) * tiles * count)?;
+        let starts = storage("tile lists", 4 * (tiles + 1) * count)?;
+        let entries = storage("tile lists", 4 * u64::from(size.capacity) * count)?;
+        let control = storage("control", 4 * (CONTROL_WORDS + 3 * u64::from(job.parameter_groups)))?;
+        context.check()?;
+
+        let project = kernels.project.bind(
+            context,
+            count,
+            &[jobs, views, &model.parameters, &model.bands, &rows, &boxes, &keys[0]],
+        );
+        let passes = [0, 1, 2, 3].map(|pass: usize| {
+            let (from, to) = (pass % 2, (pass + 1) % 2);
+            let count = kernels.sort_count.bind(context, 0, &[jobs, &keys[from], &control, &counts]);
+            let buffers = [jobs, &keys[from], &order[from], &counts, &control, &keys[to], &order[to]];
+            let moved = kernels.sort_move.bind(context, 0, &buffers);
+            let constant = context.device.create_buffer_init(&wgpu::util::BufferInitDescriptor {
+                label: Some("pass of the sort"),
+                contents: bytes_of(&[PASSES[pass], u32::from(pass == 0), 0, 0]),
+                usage: BufferUsages::UNIFORM,
+            });
+            (count, moved, kernels.sort_count.bind_second(context, &[&constant]))
+        });
+        let bin = [
+            kernels.bin_count.bind(context, 0, &[jobs, &control, &order[0], &boxes, &table]),
+            kernels.bin_offsets.bind(context, 0, &[jobs, &control, &table, &starts]),
+            kernels.bin_fill.bind(context, 0, &[jobs, &control, &order[0], &boxes, &table, &entries]),
+        ];
+        context.check()?;
+        Ok(Self { size, rows, entries, starts, control, bytes, project, sort: passes, bin })
+    }
+
+    /// Records projection, sort and binning. `offsets` are those of the job and of the views.
+    pub fn record(
+        &self,
+        pass: &mut ComputePass<'_>,
+        kernels: &Kernels,
+        offsets: &[u32; 2],
+        mark: &mut dyn FnMut(&mut ComputePass<'_>, &'static str),
+    ) {
+        let (job, views) = (self.size.job(), self.size.views);
+        mark(pass, "project");
+        let (x, y) = fold(self.size.parameter_groups());
+        dispatch(pass, &kernels.project, &self.project, offsets, (x, y, views));
+        mark(pass, "sort");
+        for (count, moved, constant) in &self.sort {
+            pass.set_pipeline(&kernels.sort_count.pipeline);
+            pass.set_bind_group(0, count, kernels.sort_count.offsets(offsets));
+            pass.set_bind_group(1, constant, &[]);
+            pass.dispatch_workgroups(job.sort_groups, 1, views);
+            pass.set_pipeline(&kernels.sort_move.pipeline);
+            pass.set_bind_group(0, moved, kernels.sort_move.offsets(offsets));
+            pass.set_bind_group(1, constant, &[]);
+            pass.dispatch_workgroups(job.sort_groups, 1, views);
+        }
+        mark(pass, "bin");
+        let parts = (job.bin_groups, self.size.tiles().div_ceil(256), views);
+        dispatch(pass, &kernels.bin_count, &self.bin[0], offsets, parts);
+        dispatch(pass, &kernels.bin_offsets, &self.bin[1], offsets, (1, 1, views));
+        dispatch(pass, &kernels.bin_fill, &self.bin[2], offsets, parts);
+    }
+}
+
+/// Records one dispatch of a kernel with a single group of bindings.
+pub(super) fn dispatch(
+    pass: &mut ComputePass<'_>,
+    kernel: &Kernel,
+    group: &BindGroup,
+    offsets: &[u32; 2],
+    (x, y, z): (u32, u32, u32),
+) {
+    pass.set_pipeline(&kernel.pipeline);
+    pass.set_bind_group(0, group, kernel.offsets(offsets));
+    pass.dispatch_workgroups(x, y, z);
+}
+
+/// A buffer of views for one batch.
+pub(super) fn views_buffer(context: &Context, views: u32) -> Result<Buffer, GpuError> {
+    context.storage("views", VIEW_BYTES * u64::from(views))
+}

@@ -1,0 +1,411 @@
+//! The GPU engine: what the CPU engine does, on an adapter.
+
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use bytemuck::{bytes_of, cast_slice, pod_collect_to_vec};
+use rayon::prelude::*;
+use wgpu::{Buffer, BufferUsages, ComputePassDescriptor, Features};
+
+use super::adapter;
+use super::buffers::Bytes;
+use super::chain::{Chain, Size, dispatch, views_buffer};
+use super::context::Context;
+use super::error::GpuError;
+use super::job::{CONTROL_HALT, CONTROL_PAIRS, JOB_BYTES, Job, VIEWS_MAX, View};
+use super::kernels::Kernels;
+use super::model::{DeviceModel, blocks_of, lanes_of};
+use super::training::{Keyframes, Trainer};
+use crate::camera::{Camera, RenderSettings};
+use crate::engine::{DEPTH_ALPHA_TINY, Moments, MomentsView, Rendered};
+use crate::model::{Gaussians, LANES, ROWS, SH_REST_MAX, sh_rest_coefficients, sh_rest_rows};
+use crate::optimiser::Optimiser;
+use crate::settings::{LossTerms, TrainingSettings};
+use crate::training::Gradient;
+use crate::view::TrainingView;
+
+/// Most bytes of a batch of views; more views are rendered one batch after the other.
+const BATCH_BYTES: u64 = 256 << 20;
+
+/// Which adapter, and what of it to use.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Options {
+    /// Name of the adapter or a part of it; `None`: the best that is not software.
+    pub adapter: Option<String>,
+    /// Do without subgroup operations.
+    pub without_subgroups: bool,
+    /// Do without atomic addition of floats.
+    pub without_float_atomics: bool,
+    /// Room for (tile, splat) pairs at first, for tests of what happens when it is not enough; 0: a good guess.
+    pub pairs: u32,
+}
+
+/// The renderer and trainer on a GPU.
+pub struct Engine {
+    context: Context,
+    kernels: Kernels,
+    model: Option<DeviceModel>,
+    trainer: Option<Trainer>,
+    keyframes: Keyframes,
+    /// Pairs per view that were needed so far, with something to spare.
+    pairs: u32,
+}
+
+impl Engine {
+    /// An engine on the adapter that the options ask for.
+    ///
+    /// # Errors
+    /// Where there is none, or it cannot run the kernels.
+    pub fn new(options: &Options) -> Result<Self, GpuError> {
+        let adapter = adapter::choose(options.adapter.as_deref())?;
+        let mut excluded = Features::empty();
+        excluded.set(Features::SUBGROUP, options.without_subgroups);
+        excluded.set(Features::SHADER_FLOAT32_ATOMIC, options.without_float_atomics);
+        let context = Context::new(&adapter, excluded)?;
+        let kernels = Kernels::new(&context)?;
+        Ok(Self { context, kernels, model: None, trainer: None, keyframes: Keyframes::default(), pairs: options.pairs })
+    }
+
+    /// Name of the adapter.
+    pub fn name(&self) -> &str {
+        &self.context.name
+    }
+
+    /// Largest part of a buffer that a kernel can see, bytes.
+    pub fn max_binding(&self) -> u64 {
+        self.context.max_binding
+    }
+
+    /// Bytes allocated on the GPU, by what for.
+    pub fn bytes(&self) -> Vec<(&'static str, u64)> {
+        let mut all: Vec<(&'static str, u64)> = Vec::new();
+        let model = self.model.iter().map(|model| model.bytes.clone());
+        let trainer = self.trainer.iter().flat_map(Trainer::all_bytes);
+        for (what, bytes) in model.chain(trainer).flat_map(Bytes::into_list) {
+            match all.iter_mut().find(|(name, _)| *name == what) {
+                Some((_, sum)) => *sum += bytes,
+                None => all.push((what, bytes)),
+            }
+        }
+        all.push(("keyframes", self.keyframes.bytes()));
+        all
+    }
+
+    fn likely_pairs(&self, gaussians: u32) -> u32 {
+        if self.pairs > 0 { self.pairs } else { Size::likely_pairs(gaussians) }
+    }
+
+    /// A quarter more than was needed: the number changes from view to view.
+    fn make_room(&mut self, pairs: u32) {
+        self.pairs = pairs.saturating_add(pairs / 4).max(1024);
+    }
+
+    /// Renders colour, alpha and expected depth, as [`crate::Engine::render`].
+    ///
+    /// # Errors
+    /// Where the GPU fails or the image is too large.
+    pub fn render(
+        &mut self,
+        gaussians: &Gaussians,
+        camera: &Camera,
+        settings: &RenderSettings,
+        out: &mut Rendered,
+    ) -> Result<(), GpuError> {
+        let pixels = camera.pixels();
+        *out = Rendered { width: camera.width, height: camera.height, ..Rendered::default() };
+        if pixels == 0 {
+            return Ok(());
+        }
+        let model = DeviceModel::upload(&self.context, gaussians, None)?;
+        let image = self.context.storage("images", 20 * pixels as u64)?;
+        let bytes = loop {
+            let size = self.size(&model, 1, camera);
+            let reached = self.context.storage("tile lists", 4 * u64::from(size.tiles() + size.capacity))?;
+            let drawing = Drawing::new(self, &model, size, &[View::new(camera, settings, 0.0)], settings.sh_degree)?;
+            let chain = &drawing.chain;
+            let blend = self.kernels.blend.bind(
+                &self.context,
+                1,
+                &[&drawing.job, &drawing.views, &chain.rows, &chain.starts, &chain.entries, &reached, &image],
+            );
+            drawing.run(self, |pass, kernels| {
+                dispatch(pass, &kernels.blend, &blend, &[0, 0], (size.tiles_x(), size.tiles_y(), 1));
+            })?;
+            let [control, bytes] = self.context.read([(&drawing.chain.control, 16), (&image, 20 * pixels as u64)])?;
+            match overflow(&control) {
+                Some(pairs) => self.make_room(pairs),
+                None => break bytes,
+            }
+        };
+        let planes: Vec<f32> = pod_collect_to_vec(&bytes);
+        let plane = |k: usize| &planes[k * pixels..(k + 1) * pixels];
+        let background = settings.background.to_array();
+        for i in 0..pixels {
+            let transmittance = plane(4)[i];
+            let alpha = 1.0 - transmittance;
+            out.color.push(std::array::from_fn(|k| plane(k)[i] + transmittance * background[k]));
+            out.alpha.push(alpha);
+            out.depth.push(if alpha < DEPTH_ALPHA_TINY { 0.0 } else { plane(3)[i] / alpha });
+        }
+        Ok(())
+    }
+
+    /// Renders the moments of many views in as few chains as their memory allows, and gives each to `visit`, as
+    /// [`crate::Engine::moments_batch`]. Views of other sizes than the first make chains of their own.
+    ///
+    /// # Errors
+    /// [`GpuError::Cancelled`] where `cancel` became true before the last chain was begun; otherwise where the GPU fails.
+    pub fn moments_batch(
+        &mut self,
+        gaussians: &Gaussians,
+        views: &[MomentsView],
+        settings: &RenderSettings,
+        cancel: &AtomicBool,
+        visit: impl Fn(usize, &Moments) + Sync,
+    ) -> Result<(), GpuError> {
+        let model = DeviceModel::upload(&self.context, gaussians, None)?;
+        let mut done = 0;
+        while done < views.len() {
+            if cancel.load(Ordering::Relaxed) {
+                return Err(GpuError::Cancelled);
+            }
+            let camera = views[done].camera;
+            let fits = |view: &MomentsView| (view.camera.width, view.camera.height) == (camera.width, camera.height);
+            let same = views[done..].iter().take_while(|view| fits(view)).count();
+            let room = self.views_at_once(&self.size(&model, 1, &camera));
+            let batch = &views[done..done + same.min(room)];
+            if self.moments_of(&model, batch, settings, |index, moments| visit(done + index, moments))? {
+                done += batch.len();
+            }
+        }
+        Ok(())
+    }
+
+    /// One chain of views of one size; `false` where lists did not fit: there is more room now.
+    fn moments_of(
+        &mut self,
+        model: &DeviceModel,
+        views: &[MomentsView],
+        settings: &RenderSettings,
+        visit: impl Fn(usize, &Moments) + Sync,
+    ) -> Result<bool, GpuError> {
+        let camera = &views[0].camera;
+        let (width, height, pixels) = (camera.width, camera.height, camera.pixels());
+        let count = views.len() as u32;
+        let size = self.size(model, count, camera);
+        let bytes = 12 * pixels as u64 * u64::from(count);
+        let out = self.context.storage("moments", bytes)?;
+        let described: Vec<View> =
+            views.iter().map(|view| View::new(&view.camera, settings, view.reference_m)).collect();
+        let drawing = Drawing::new(self, model, size, &described, 0)?;
+        let chain = &drawing.chain;
+        let group = self.kernels.moments.bind(
+            &self.context,
+            count.into(),
+            &[&drawing.job, &drawing.views, &chain.rows, &chain.starts, &chain.entries, &out],
+        );
+        drawing.run(self, |pass, kernels| {
+            dispatch(pass, &kernels.moments, &group, &[0, 0], (size.tiles_x(), size.tiles_y(), count));
+        })?;
+        let [control, bytes] = self.context.read([(&drawing.chain.control, 16), (&out, bytes)])?;
+        if let Some(pairs) = overflow(&control) {
+            self.make_room(pairs);
+            return Ok(false);
+        }
+        let planes: Vec<f32> = pod_collect_to_vec(&bytes);
+        planes.par_chunks(3 * pixels.max(1)).enumerate().for_each(|(index, planes)| {
+            let plane = |k: usize| planes[k * pixels..(k + 1) * pixels].to_vec();
+            let reference_m = views[index].reference_m;
+            visit(index, &Moments { width, height, reference_m, alpha: plane(0), first: plane(1), second: plane(2) });
+        });
+        Ok(true)
+    }
+
+    fn size(&self, model: &DeviceModel, views: u32, camera: &Camera) -> Size {
+        let gaussians = model.gaussians;
+        let (width, height) = (camera.width, camera.height);
+        Size { gaussians, views, width, height, capacity: self.likely_pairs(gaussians) }
+    }
+
+    /// Views of this size that fit a chain.
+    fn views_at_once(&self, size: &Size) -> usize {
+        let parts = size.bytes_per_view();
+        let by_binding = parts.iter().map(|&bytes| self.context.max_binding / bytes.max(1)).min().unwrap_or(1);
+        let by_memory = BATCH_BYTES / parts.iter().sum::<u64>().max(1);
+        by_binding.min(by_memory).clamp(1, VIEWS_MAX.into()) as usize
+    }
+
+    /// Puts a model under training on the GPU. From now on [`Engine::step`] changes it there.
+    ///
+    /// # Errors
+    /// Where it does not fit, or the GPU fails.
+    pub fn upload(&mut self, gaussians: &Gaussians, optimiser: &mut Optimiser) -> Result<(), GpuError> {
+        optimiser.fit(gaussians);
+        self.trainer = None;
+        self.model = None;
+        self.model = Some(DeviceModel::upload(&self.context, gaussians, Some(optimiser))?);
+        Ok(())
+    }
+
+    /// Copies the model under training back, after all iterations that were asked for.
+    ///
+    /// # Errors
+    /// Where the GPU fails; what is given is then as it was.
+    pub fn download(&mut self, gaussians: &mut Gaussians, optimiser: &mut Optimiser) -> Result<(), GpuError> {
+        self.finish()?;
+        match &self.model {
+            Some(model) => model.download(&self.context, gaussians, optimiser),
+            None => Ok(()),
+        }
+    }
+
+    /// Asks for one step of Adam on one view, as [`crate::Engine::train_step`]. It happens later: its loss comes with
+    /// [`Engine::finished`]. Without a model, nothing is done.
+    ///
+    /// # Errors
+    /// Where the GPU fails. Nothing is known of the model then.
+    pub fn step(&mut self, view: &TrainingView, settings: &TrainingSettings) -> Result<(), GpuError> {
+        self.ready(view)?;
+        if let (Some(trainer), Some(model)) = (&mut self.trainer, &self.model) {
+            trainer.push(&self.context, &self.kernels, (model, &mut self.keyframes), view, settings)?;
+        }
+        self.collect(false)
+    }
+
+    /// Losses that have arrived since the last call, in the order of the steps.
+    ///
+    /// # Errors
+    /// Where the GPU fails.
+    pub fn finished(&mut self) -> Result<Vec<LossTerms>, GpuError> {
+        self.collect(false)?;
+        Ok(self.trainer.as_mut().map(Trainer::take_finished).unwrap_or_default())
+    }
+
+    /// Waits until all iterations that were asked for are done.
+    ///
+    /// # Errors
+    /// Where the GPU fails.
+    pub fn finish(&mut self) -> Result<(), GpuError> {
+        while self.trainer.as_ref().is_some_and(|trainer| !trainer.is_idle()) {
+            if let (Some(trainer), Some(model)) = (&mut self.trainer, &self.model) {
+                trainer.submit(&self.context, &self.kernels, model, &self.keyframes)?;
+            }
+            self.collect(true)?;
+        }
+        Ok(())
+    }
+
+    /// The loss of a view and its gradient by every parameter; nothing moves. As [`crate::Engine::gradient`], for tests
+    /// and tools. A model under training is put away: upload it again.
+    ///
+    /// # Errors
+    /// Where the GPU fails.
+    pub fn gradient(
+        &mut self,
+        gaussians: &Gaussians,
+        view: &TrainingView,
+        settings: &TrainingSettings,
+    ) -> Result<(LossTerms, Gradient), GpuError> {
+        self.upload(gaussians, &mut Optimiser::new())?;
+        let (terms, parameters, bands) = loop {
+            self.ready(view)?;
+            let (Some(trainer), Some(model)) = (&mut self.trainer, &self.model) else { continue };
+            let keyframes = (model, &mut self.keyframes);
+            match trainer.gradient(&self.context, &self.kernels, keyframes, view, settings)? {
+                Ok(found) => break found,
+                Err(pairs) => {
+                    self.make_room(pairs);
+                    self.trainer = None;
+                }
+            }
+        };
+        self.trainer = None;
+        self.model = None;
+        let (blocks, bands) = (blocks_of(&parameters), lanes_of(&bands));
+        let rows = sh_rest_rows(gaussians.sh_degree());
+        let evaluated = sh_rest_coefficients(gaussians.sh_degree().min(settings.render.sh_degree));
+        let mut out = Gradient::default();
+        for i in 0..gaussians.len() {
+            let (block, lane) = (i / LANES, i % LANES);
+            out.parameters.push(std::array::from_fn::<f32, ROWS, _>(|row| blocks[block].0[row].0[lane]));
+            let mut rest = [[0.0; 3]; SH_REST_MAX];
+            for (k, to) in rest.iter_mut().enumerate().take(evaluated) {
+                *to = std::array::from_fn(|channel| bands[block * rows + 3 * k + channel].0[lane]);
+            }
+            out.sh_rest.push(rest);
+        }
+        Ok((terms, out))
+    }
+
+    /// Makes sure that there is a trainer for views of this size.
+    fn ready(&mut self, view: &TrainingView) -> Result<(), GpuError> {
+        let Some(model) = &self.model else { return Ok(()) };
+        let size = self.size(model, 1, view.camera());
+        let shape = |size: Size| (size.width, size.height);
+        if self.trainer.as_ref().is_none_or(|trainer| shape(trainer.size()) != shape(size)) {
+            self.finish()?;
+            self.replace_trainer(size)?;
+        }
+        Ok(())
+    }
+
+    fn replace_trainer(&mut self, size: Size) -> Result<(), GpuError> {
+        let Some(model) = &self.model else { return Ok(()) };
+        let mut old = self.trainer.take();
+        let mut new = Trainer::new(&self.context, &self.kernels, model, size)?;
+        if let Some(old) = &mut old {
+            new.inherit(old);
+        }
+        self.trainer = Some(new);
+        Ok(())
+    }
+
+    fn collect(&mut self, all: bool) -> Result<(), GpuError> {
+        let Some(trainer) = &mut self.trainer else { return Ok(()) };
+        let Some(pairs) = trainer.collect(&self.context, all)? else { return Ok(()) };
+        let size = trainer.size();
+        self.make_room(pairs);
+        self.replace_trainer(Size { capacity: self.pairs, ..size })
+    }
+}
+
+/// How many pairs a view had, where there was no room for them.
+fn overflow(control: &[u8]) -> Option<u32> {
+    let words: Vec<u32> = pod_collect_to_vec(control);
+    (words[CONTROL_HALT] != 0).then(|| words[CONTROL_PAIRS])
+}
+
+/// A chain that is run once.
+struct Drawing {
+    job: Buffer,
+    views: Buffer,
+    chain: Chain,
+}
+
+impl Drawing {
+    fn new(engine: &Engine, model: &DeviceModel, size: Size, views: &[View], sh_degree: u8) -> Result<Self, GpuError> {
+        let context = &engine.context;
+        let job = context.buffer("jobs", JOB_BYTES, BufferUsages::UNIFORM | BufferUsages::COPY_DST);
+        let degree = model.sh_degree.min(sh_degree);
+        let described = Job {
+            bands: sh_rest_coefficients(degree) as u32,
+            band_rows: sh_rest_rows(model.sh_degree) as u32,
+            ..size.job()
+        };
+        context.queue.write_buffer(&job, 0, bytes_of(&described));
+        let buffer = views_buffer(context, size.views)?;
+        context.queue.write_buffer(&buffer, 0, cast_slice(views));
+        let chain = Chain::new(context, &engine.kernels, model, size, (&job, &buffer))?;
+        Ok(Self { job, views: buffer, chain })
+    }
+
+    /// Runs the chain and what `last` records after it.
+    fn run(&self, engine: &Engine, last: impl FnOnce(&mut wgpu::ComputePass<'_>, &Kernels)) -> Result<(), GpuError> {
+        let mut encoder = engine.context.encoder();
+        let mut pass = encoder.begin_compute_pass(&ComputePassDescriptor::default());
+        self.chain.record(&mut pass, &engine.kernels, &[0, 0], &mut |_, _| {});
+        last(&mut pass, &engine.kernels);
+        drop(pass);
+        engine.context.queue.submit([encoder.finish()]);
+        engine.context.check()
+    }
+}

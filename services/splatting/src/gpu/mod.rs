@@ -1,0 +1,25 @@
+//! The GPU back end: the same model, images, losses and steps as the CPU engine, on any adapter that wgpu reaches.
+//!
+//! Kernels are the files of `shaders/`, one each, with the source of what they compute. An iteration is 19 dispatches:
+//! projection, four passes of an exact radix sort by depth (two each), three of binning, blending, similarity, loss,
+//! backward blending, Adam with the projection's backward pass, and the sum of the terms. What one leaves the next one
+//! reads; nothing is read back before the host asks for it, and what the host learns late (the terms of the loss, lists
+//! that did not fit) is made so that lateness does no harm.
+
+mod adapter;
+mod buffers;
+mod chain;
+mod context;
+mod engine;
+mod error;
+mod job;
+mod kernels;
+mod keyframe;
+mod model;
+#[cfg(test)]
+mod tests;
+mod training;
+
+pub use adapter::{AdapterReport, adapters};
+pub use engine::{Engine, Options};
+pub use error::GpuError;

@@ -1,0 +1,123 @@
+//! A model and its optimiser on the GPU: the same blocks of 16 Gaussians, byte for byte.
+
+use bytemuck::{cast_slice, pod_collect_to_vec};
+use wgpu::Buffer;
+
+use super::buffers::Bytes;
+use super::context::Context;
+use super::error::GpuError;
+use crate::model::{Block, Gaussians, LANES, Lanes, ROWS, sh_rest_rows};
+use crate::optimiser::Optimiser;
+
+const LANES_BYTES: u64 = size_of::<Lanes>() as u64;
+const BLOCK_BYTES: u64 = size_of::<Block>() as u64;
+
+/// Buffers of a model.
+pub(super) struct DeviceModel {
+    pub parameters: Buffer,
+    pub bands: Buffer,
+    pub gaussians: u32,
+    pub sh_degree: u8,
+    /// What only training needs.
+    pub optimiser: Option<DeviceOptimiser>,
+    pub bytes: Bytes,
+}
+
+/// Adam's state: first moments of all blocks, then second moments.
+pub(super) struct DeviceOptimiser {
+    pub state: Buffer,
+    pub band_state: Buffer,
+    pub steps: Buffer,
+}
+
+fn rows_of(lanes: &[Lanes]) -> Vec<u8> {
+    lanes.iter().flat_map(|row| cast_slice::<f32, u8>(&row.0)).copied().collect()
+}
+
+fn rows_of_blocks(blocks: &[Block]) -> Vec<u8> {
+    blocks.iter().flat_map(|block| &block.0).flat_map(|row| cast_slice::<f32, u8>(&row.0)).copied().collect()
+}
+
+pub(super) fn lanes_of(bytes: &[u8]) -> Vec<Lanes> {
+    let values: Vec<f32> = pod_collect_to_vec(bytes);
+    values.as_chunks::<LANES>().0.iter().map(|&row| Lanes(row)).collect()
+}
+
+pub(super) fn blocks_of(bytes: &[u8]) -> Vec<Block> {
+    let rows = lanes_of(bytes);
+    rows.as_chunks::<ROWS>().0.iter().map(|&rows| Block(rows)).collect()
+}
+
+impl DeviceModel {
+    /// Copies a model to the GPU; with an optimiser, which must have the model's shape, also its state.
+    pub fn upload(context: &Context, model: &Gaussians, optimiser: Option<&Optimiser>) -> Result<Self, GpuError> {
+        let blocks = model.blocks().len() as u64;
+        let rows = blocks * sh_rest_rows(model.sh_degree()) as u64;
+        let mut bytes = Bytes::default();
+        let mut storage = |what: &'static str, length: u64| -> Result<Buffer, GpuError> {
+            let buffer = context.storage(what, length)?;
+            bytes.add(what, &buffer);
+            Ok(buffer)
+        };
+        let parameters = storage("parameters", BLOCK_BYTES * blocks)?;
+        let bands = storage("parameters", LANES_BYTES * rows)?;
+        let state = match optimiser {
+            Some(_) => Some(DeviceOptimiser {
+                state: storage("optimiser", 2 * BLOCK_BYTES * blocks)?,
+                band_state: storage("optimiser", 2 * LANES_BYTES * rows)?,
+                steps: storage("optimiser", 4 * model.len() as u64)?,
+            }),
+            None => None,
+        };
+        context.check()?;
+        let write = |buffer: &Buffer, offset: u64, bytes: &[u8]| {
+            if !bytes.is_empty() {
+                context.queue.write_buffer(buffer, offset, bytes);
+            }
+        };
+        write(&parameters, 0, &rows_of_blocks(model.blocks()));
+        write(&bands, 0, &rows_of(model.rest()));
+        if let (Some(device), Some(host)) = (&state, optimiser) {
+            write(&device.state, 0, &rows_of_blocks(&host.first));
+            write(&device.state, BLOCK_BYTES * blocks, &rows_of_blocks(&host.second));
+            write(&device.band_state, 0, &rows_of(&host.first_rest));
+            write(&device.band_state, LANES_BYTES * rows, &rows_of(&host.second_rest));
+            write(&device.steps, 0, cast_slice(&host.steps));
+        }
+        // So that the copies do not wait in memory for the first iteration.
+        context.queue.submit([]);
+        context.check()?;
+        let (gaussians, sh_degree) = (model.len() as u32, model.sh_degree());
+        Ok(Self { parameters, bands, gaussians, sh_degree, optimiser: state, bytes })
+    }
+
+    /// Copies what training changed back.
+    pub fn download(
+        &self,
+        context: &Context,
+        model: &mut Gaussians,
+        optimiser: &mut Optimiser,
+    ) -> Result<(), GpuError> {
+        let Some(device) = &self.optimiser else { return Ok(()) };
+        let blocks = model.blocks().len();
+        let rows = blocks * sh_rest_rows(self.sh_degree);
+        let (block_bytes, row_bytes) = (BLOCK_BYTES * blocks as u64, LANES_BYTES * rows as u64);
+        let [parameters, bands, state, band_state, steps] = context.read([
+            (&self.parameters, block_bytes),
+            (&self.bands, row_bytes),
+            (&device.state, 2 * block_bytes),
+            (&device.band_state, 2 * row_bytes),
+            (&device.steps, 4 * u64::from(self.gaussians)),
+        ])?;
+        let (model_blocks, model_rest) = model.parts_mut();
+        model_blocks.copy_from_slice(&blocks_of(&parameters));
+        model_rest.copy_from_slice(&lanes_of(&bands));
+        let (first, second) = state.split_at(block_bytes as usize);
+        (optimiser.first, optimiser.second) = (blocks_of(first), blocks_of(second));
+        let (first, second) = band_state.split_at(row_bytes as usize);
+        (optimiser.first_rest, optimiser.second_rest) = (lanes_of(first), lanes_of(second));
+        optimiser.sh_degree = self.sh_degree;
+        optimiser.steps = pod_collect_to_vec(&steps);
+        Ok(())
+    }
+}

@@ -1,0 +1,166 @@
+//! Steps on the GPU against steps on the CPU.
+
+use glam::Vec3;
+
+use super::super::{Engine, Options};
+use super::{options, skipped, with_engine};
+use crate::tests::harmonics::scene_of_degree;
+use crate::tests::{camera, random_view, scene};
+use crate::{Gaussians, LossTerms, Optimiser, Pose, RenderSettings, Rendered, TrainingSettings, TrainingView};
+
+/// Keyframes of a scene around it, and a disturbed copy to begin with.
+fn task(count: usize, size: (u32, u32), degree: u8) -> (Gaussians, Vec<TrainingView>) {
+    let truth = scene_of_degree(count, 11, degree);
+    let mut cpu = crate::Engine::new(1).unwrap();
+    let views = (0..4)
+        .map(|i| {
+            let angle = 1.3 * i as f32;
+            let camera = crate::Camera::from_hfov(Pose::IDENTITY, 1.0, size.0, size.1).look_at(
+                Vec3::new(2.0 * angle.cos(), 2.0 * angle.sin(), 0.5),
+                Vec3::ZERO,
+                Vec3::Z,
+            );
+            let mut image = Rendered::default();
+            cpu.render(&truth, &camera, &RenderSettings::default(), &mut image);
+            TrainingView::full_image(camera, &image.color, &image.depth).unwrap()
+        })
+        .collect();
+    let mut start = truth;
+    for i in 0..start.len() {
+        let mut gaussian = start.get(i);
+        gaussian.mean += 0.03 * Vec3::new((i as f32).sin(), (2.0 * i as f32).cos(), (3.0 * i as f32).sin());
+        gaussian.sh = gaussian.sh.map(|c| 0.6 * c);
+        start.set(i, &gaussian);
+    }
+    (start, views)
+}
+
+/// Slow enough that a hundred iterations do not converge: there, rounding decides about decibels.
+fn settings() -> TrainingSettings {
+    TrainingSettings {
+        lr_means: 3e-4,
+        lr_log_scales: 2e-3,
+        lr_opacity: 0.01,
+        lr_sh: 4e-3,
+        lr_sh_rest: 4e-4,
+        ..TrainingSettings::default()
+    }
+}
+
+fn on_cpu(start: &Gaussians, views: &[TrainingView], iterations: usize) -> (Gaussians, Optimiser, Vec<LossTerms>) {
+    let (mut model, mut optimiser) = (start.clone(), Optimiser::new());
+    let mut engine = crate::Engine::new(1).unwrap();
+    let step = |i: usize| engine.train_step(&mut model, &mut optimiser, &views[i % views.len()], &settings());
+    let terms = (0..iterations).map(step).collect();
+    (model, optimiser, terms)
+}
+
+fn on_gpu(
+    engine: &mut Engine,
+    start: &Gaussians,
+    views: &[TrainingView],
+    iterations: usize,
+) -> (Gaussians, Optimiser, Vec<LossTerms>) {
+    let (mut model, mut optimiser) = (start.clone(), Optimiser::new());
+    engine.upload(&model, &mut optimiser).unwrap();
+    let mut terms = Vec::new();
+    for i in 0..iterations {
+        engine.step(&views[i % views.len()], &settings()).unwrap();
+        terms.extend(engine.finished().unwrap());
+    }
+    engine.download(&mut model, &mut optimiser).unwrap();
+    terms.extend(engine.finished().unwrap());
+    (model, optimiser, terms)
+}
+
+fn mean_psnr(model: &Gaussians, views: &[TrainingView]) -> f64 {
+    let mut engine = crate::Engine::new(1).unwrap();
+    let one = |view| engine.gradient(model, view, &settings()).0.foreground_psnr_db();
+    views.iter().map(one).sum::<f64>() / views.len() as f64
+}
+
+#[test]
+fn a_hundred_iterations_end_where_the_cpu_ends() {
+    with_engine("a_hundred_iterations_end_where_the_cpu_ends", |engine| {
+        let (start, views) = task(300, (48, 40), 0);
+        let (cpu, cpu_state, cpu_terms) = on_cpu(&start, &views, 100);
+        let (gpu, gpu_state, gpu_terms) = on_gpu(engine, &start, &views, 100);
+        let (before, on_cpu, on_gpu) = (mean_psnr(&start, &views), mean_psnr(&cpu, &views), mean_psnr(&gpu, &views));
+        println!("{before:.2} dB at first, {on_cpu:.3} dB on the CPU, {on_gpu:.3} dB on the GPU");
+        assert!(on_cpu > before + 3.0 && (on_cpu - on_gpu).abs() < 0.1, "{before} {on_cpu} {on_gpu}");
+        assert_eq!(gpu_terms.len(), 100);
+        for (i, (cpu, gpu)) in cpu_terms.iter().zip(&gpu_terms).enumerate().take(10) {
+            assert!((cpu.total - gpu.total).abs() < 1e-3 * cpu.total, "iteration {i}: {cpu:?} {gpu:?}");
+        }
+        let same = (0..cpu.len()).filter(|&i| cpu_state.steps(i) == gpu_state.steps(i)).count();
+        assert!(100 * same > 95 * cpu.len(), "Gaussians move only when they are drawn: {same} of {}", cpu.len());
+        assert!(gpu.is_finite());
+    });
+}
+
+#[test]
+fn the_first_step_moves_every_parameter_as_on_the_cpu() {
+    with_engine("the_first_step_moves_every_parameter_as_on_the_cpu", |engine| {
+        for degree in [0, 2] {
+            let (start, views) = task(120, (40, 40), degree);
+            let (cpu, ..) = on_cpu(&start, &views, 1);
+            let (gpu, ..) = on_gpu(engine, &start, &views, 1);
+            let mut apart = 0;
+            for i in 0..cpu.len() {
+                // A first step is the learning rate times the sign of the gradient: it may differ where that is next to 0.
+                let (a, b) = (cpu.get(i), gpu.get(i));
+                let near = (a.mean - b.mean).length() < 1e-5
+                    && (a.log_scales - b.log_scales).length() < 1e-4
+                    && (a.rotation - b.rotation).length() < 1e-4
+                    && (a.opacity_logit - b.opacity_logit).abs() < 1e-3
+                    && (0..3).all(|k| (a.sh[k] - b.sh[k]).abs() < 1e-4);
+                let (a, b) = (cpu.sh_rest(i), gpu.sh_rest(i));
+                let bands = a.iter().flatten().zip(b.iter().flatten()).all(|(a, b)| (a - b).abs() < 1e-4);
+                apart += usize::from(!near || !bands);
+            }
+            assert!(apart <= 3, "degree {degree}: {apart} of {} Gaussians", cpu.len());
+        }
+    });
+}
+
+#[test]
+fn what_goes_up_comes_down_bit_for_bit() {
+    with_engine("what_goes_up_comes_down_bit_for_bit", |engine| {
+        let (start, views) = task(77, (24, 24), 1);
+        let (model, optimiser, _) = on_cpu(&start, &views, 5);
+        let (mut back, mut state) = (model.clone(), optimiser.clone());
+        engine.upload(&model, &mut state).unwrap();
+        engine.download(&mut back, &mut state).unwrap();
+        assert!(back == model && state == optimiser);
+    });
+}
+
+#[test]
+fn lists_that_do_not_fit_cost_time_and_nothing_else() {
+    let test = "lists_that_do_not_fit_cost_time_and_nothing_else";
+    let Some(options) = options() else { return skipped(test) };
+    let (start, views) = task(400, (64, 48), 0);
+    let mut small = Engine::new(&Options { pairs: 40, ..options.clone() }).unwrap();
+    let mut large = Engine::new(&options).unwrap();
+    let (a, state_a, terms_a) = on_gpu(&mut small, &start, &views, 40);
+    let (b, state_b, terms_b) = on_gpu(&mut large, &start, &views, 40);
+    assert_eq!((terms_a.len(), terms_b.len()), (40, 40), "every iteration is there once");
+    let steps = |state: &Optimiser| (0..start.len()).map(|i| u64::from(state.steps(i))).sum::<u64>();
+    // Sums of floats have no order on a GPU, so a splat at a cut may differ.
+    assert!(steps(&state_a).abs_diff(steps(&state_b)) <= 40, "{} {}", steps(&state_a), steps(&state_b));
+    assert!((mean_psnr(&a, &views) - mean_psnr(&b, &views)).abs() < 0.1);
+}
+
+#[test]
+fn views_of_different_sizes_take_turns() {
+    with_engine("views_of_different_sizes_take_turns", |engine| {
+        let model = scene(100, 3);
+        let views = [random_view(camera(32, 24), 1), random_view(camera(24, 40), 2)];
+        let (_, _, gpu) = on_gpu(engine, &model, &views, 4);
+        let (_, _, cpu) = on_cpu(&model, &views, 4);
+        assert_eq!(gpu.len(), 4);
+        for (gpu, cpu) in gpu.iter().zip(&cpu) {
+            assert!((gpu.total - cpu.total).abs() < 2e-3 * cpu.total, "{gpu:?} {cpu:?}");
+        }
+    });
+}

@@ -1,0 +1,454 @@
+//! Training on the GPU: iterations are queued, recorded several at a time, and tell their losses when they have them.
+
+use std::collections::{BTreeMap, VecDeque};
+
+use bytemuck::{bytes_of, pod_collect_to_vec};
+use wgpu::{BindGroup, Buffer, BufferUsages, ComputePassDescriptor};
+
+use super::buffers::Bytes;
+use super::chain::{Chain, Size, dispatch};
+use super::context::{Context, Mapping, copy};
+use super::error::GpuError;
+use super::job::{Job, STRIDE, View, fold};
+use super::kernels::{Kernel, Kernels};
+use super::keyframe::DeviceKeyframe;
+use super::model::DeviceModel;
+use crate::settings::{LossTerms, TrainingSettings};
+use crate::view::TrainingView;
+
+/// Iterations of a submission.
+const ITERATIONS: usize = 16;
+/// Submissions that may be under way; then the host waits for the oldest.
+const AHEAD: usize = 3;
+/// Words of an iteration in the ring of terms.
+const RING_WORDS: usize = 12;
+/// Most bytes that keyframes take; the one not used for longest goes first.
+const KEYFRAMES_MAX: u64 = 512 << 20;
+
+/// What of a keyframe turns sums into means.
+#[derive(Clone, Copy)]
+struct Counts {
+    samples: f64,
+    foreground: usize,
+    free: usize,
+    with_depth: usize,
+}
+
+impl Counts {
+    fn new(view: &TrainingView) -> Self {
+        let samples = 3.0 * view.camera().pixels() as f64;
+        Self { samples, foreground: view.foreground, free: view.free, with_depth: view.with_depth }
+    }
+}
+
+/// An iteration that was asked for.
+#[derive(Clone, Copy)]
+struct Iteration {
+    keyframe: u64,
+    counts: Counts,
+    view: View,
+    settings: TrainingSettings,
+}
+
+/// Iterations on their way.
+struct Flight {
+    iterations: Vec<Iteration>,
+    staging: Buffer,
+    mapping: Mapping,
+}
+
+/// Everything that a model under training has on the GPU, besides the model.
+pub(super) struct Trainer {
+    chain: Chain,
+    jobs: Buffer,
+    views: Buffer,
+    ring: Buffer,
+    /// Sums of ten moments of every Gaussian.
+    gradients: Buffer,
+    blend: BindGroup,
+    ssim: BindGroup,
+    loss: BindGroup,
+    backward: BindGroup,
+    adam: BindGroup,
+    metrics: BindGroup,
+    pub bytes: Bytes,
+    waiting: Vec<Iteration>,
+    flights: VecDeque<Flight>,
+    idle: Vec<Buffer>,
+    finished: VecDeque<LossTerms>,
+    /// Iterations that were recorded, to know which keyframe was used last.
+    recorded: u64,
+}
+
+/// Keyframes by [`TrainingView::id`].
+#[derive(Default)]
+pub(super) struct Keyframes {
+    held: BTreeMap<u64, DeviceKeyframe>,
+}
+
+impl Keyframes {
+    pub fn bytes(&self) -> u64 {
+        self.held.values().map(|keyframe| keyframe.bytes).sum()
+    }
+
+    /// Makes sure that a keyframe is there, and room for it.
+    fn hold(&mut self, context: &Context, kernels: &Kernels, view: &TrainingView, now: u64) -> Result<(), GpuError> {
+        if !self.held.contains_key(&view.id()) {
+            let keyframe = DeviceKeyframe::upload(context, kernels, view)?;
+            while self.bytes() + keyframe.bytes > KEYFRAMES_MAX {
+                let oldest = self.held.iter().min_by_key(|(_, keyframe)| keyframe.used).map(|(&id, _)| id);
+                match oldest {
+                    // What was recorded keeps its buffers alive.
+                    Some(id) => self.held.remove(&id),
+                    None => break,
+                };
+            }
+            self.held.insert(view.id(), keyframe);
+        }
+        if let Some(keyframe) = self.held.get_mut(&view.id()) {
+            keyframe.used = now;
+        }
+        Ok(())
+    }
+}
+
+impl Trainer {
+    pub fn new(context: &Context, kernels: &Kernels, model: &DeviceModel, size: Size) -> Result<Self, GpuError> {
+        let Some(optimiser) = &model.optimiser else {
+            return Err(GpuError::Refused("a model without an optimiser cannot be trained".to_owned()));
+        };
+        let mut bytes = Bytes::default();
+        let jobs = context.buffer("jobs", STRIDE * ITERATIONS as u64, BufferUsages::UNIFORM | BufferUsages::COPY_DST);
+        let views = context.storage("views", STRIDE * ITERATIONS as u64)?;
+        let chain = Chain::new(context, kernels, model, size, (&jobs, &views))?;
+        let mut storage = |what: &'static str, length: u64| -> Result<Buffer, GpuError> {
+            let buffer = context.storage(what, length)?;
+            bytes.add(what, &buffer);
+            Ok(buffer)
+        };
+        let tiles = u64::from(size.tiles());
+        let ring = storage("terms of the loss", 4 * (RING_WORDS * ITERATIONS) as u64)?;
+        let terms = storage("terms of the loss", 32 * tiles)?;
+        let gradients = storage("gradients", 48 * u64::from(size.gaussians))?;
+        let image = storage("images", 40 * size.pixels())?;
+        let maps = storage("images", 36 * size.pixels())?;
+        let reached = storage("tile lists", 4 * (tiles + u64::from(size.capacity)))?;
+        context.check()?;
+        let (jobs_ref, views_ref) = (&jobs, &views);
+        let blend = kernels.blend.bind(
+            context,
+            1,
+            &[jobs_ref, views_ref, &chain.rows, &chain.starts, &chain.entries, &reached, &image],
+        );
+        let ssim = kernels.ssim.bind(context, 1, &[jobs_ref, views_ref, &image, &maps, &terms]);
+        let loss = kernels.loss.bind(context, 1, &[jobs_ref, views_ref, &image, &maps, &terms]);
+        let backward = kernels.backward.bind(
+            context,
+            1,
+            &[jobs_ref, views_ref, &chain.rows, &chain.starts, &chain.entries, &reached, &image, &gradients],
+        );
+        let adam = kernels.adam.bind(
+            context,
+            1,
+            &[
+                jobs_ref,
+                views_ref,
+                &model.parameters,
+                &model.bands,
+                &optimiser.state,
+                &optimiser.band_state,
+                &optimiser.steps,
+                &gradients,
+                &chain.control,
+            ],
+        );
+        let metrics = kernels.metrics.bind(context, 0, &[jobs_ref, &chain.control, &terms, &ring]);
+        context.check()?;
+        Ok(Self {
+            chain,
+            jobs,
+            views,
+            ring,
+            gradients,
+            blend,
+            ssim,
+            loss,
+            backward,
+            adam,
+            metrics,
+            bytes,
+            waiting: Vec::new(),
+            flights: VecDeque::new(),
+            idle: Vec::new(),
+            finished: VecDeque::new(),
+            recorded: 0,
+        })
+    }
+
+    pub fn size(&self) -> Size {
+        self.chain.size
+    }
+
+    pub fn all_bytes(&self) -> impl Iterator<Item = Bytes> + '_ {
+        [self.bytes.clone(), self.chain.bytes.clone()].into_iter()
+    }
+
+    /// Whether every iteration that was asked for has told its loss.
+    pub fn is_idle(&self) -> bool {
+        self.waiting.is_empty() && self.flights.is_empty()
+    }
+
+    /// Takes the place of a trainer of another size: what that one still had to do goes on here.
+    pub fn inherit(&mut self, other: &mut Self) {
+        self.finished = std::mem::take(&mut other.finished);
+        self.waiting = std::mem::take(&mut other.waiting);
+        self.recorded = other.recorded;
+    }
+
+    /// Asks for an iteration; submits once enough are waiting.
+    pub fn push(
+        &mut self,
+        context: &Context,
+        kernels: &Kernels,
+        (model, keyframes): (&DeviceModel, &mut Keyframes),
+        view: &TrainingView,
+        settings: &TrainingSettings,
+    ) -> Result<(), GpuError> {
+        self.recorded += 1;
+        keyframes.hold(context, kernels, view, self.recorded)?;
+        self.waiting.push(Iteration {
+            keyframe: view.id(),
+            counts: Counts::new(view),
+            view: View::new(view.camera(), &settings.render, 0.0),
+            settings: *settings,
+        });
+        if self.waiting.len() >= ITERATIONS {
+            self.submit(context, kernels, model, keyframes)?;
+        }
+        Ok(())
+    }
+
+    /// Submits what is waiting.
+    pub fn submit(
+        &mut self,
+        context: &Context,
+        kernels: &Kernels,
+        model: &DeviceModel,
+        keyframes: &Keyframes,
+    ) -> Result<(), GpuError> {
+        while !self.waiting.is_empty() {
+            let rest = self.waiting.split_off(self.waiting.len().min(ITERATIONS));
+            let iterations = std::mem::replace(&mut self.waiting, rest);
+            for (slot, iteration) in iterations.iter().enumerate() {
+                let job = job(self.chain.size, model, slot as u32, iteration);
+                context.queue.write_buffer(&self.jobs, STRIDE * slot as u64, bytes_of(&job));
+                context.queue.write_buffer(&self.views, STRIDE * slot as u64, bytes_of(&iteration.view));
+            }
+            let mut encoder = context.encoder();
+            let mut pass = encoder.begin_compute_pass(&ComputePassDescriptor::default());
+            for (slot, iteration) in iterations.iter().enumerate() {
+                let offset = (STRIDE * slot as u64) as u32;
+                self.record(&mut pass, kernels, keyframes, &[offset, offset], iteration, (&kernels.adam, &self.adam));
+            }
+            drop(pass);
+            let bytes = self.ring.size();
+            let staging = self.idle.pop().unwrap_or_else(|| context.staging(bytes));
+            encoder.copy_buffer_to_buffer(&self.ring, 0, &staging, 0, bytes);
+            context.queue.submit([encoder.finish()]);
+            let mapping = Mapping::begin(&staging);
+            self.flights.push_back(Flight { iterations, staging, mapping });
+        }
+        context.check()
+    }
+
+    /// Records the dispatches of one iteration, of which `last` takes the gradients.
+    fn record(
+        &self,
+        pass: &mut wgpu::ComputePass<'_>,
+        kernels: &Kernels,
+        keyframes: &Keyframes,
+        offsets: &[u32; 2],
+        iteration: &Iteration,
+        (last, group): (&Kernel, &BindGroup),
+    ) {
+        let size = self.chain.size;
+        let Some(keyframe) = keyframes.held.get(&iteration.keyframe) else { return };
+        self.chain.record(pass, kernels, offsets, &mut |_, _| {});
+        let grid = (size.tiles_x(), size.tiles_y(), 1);
+        dispatch(pass, &kernels.blend, &self.blend, offsets, grid);
+        pass.set_bind_group(1, &keyframe.ssim, &[]);
+        dispatch(pass, &kernels.ssim, &self.ssim, offsets, grid);
+        pass.set_bind_group(1, &keyframe.loss, &[]);
+        dispatch(pass, &kernels.loss, &self.loss, offsets, grid);
+        dispatch(pass, &kernels.backward, &self.backward, offsets, (2 * size.tiles_x(), 2 * size.tiles_y(), 1));
+        let (x, y) = fold(size.parameter_groups());
+        dispatch(pass, last, group, offsets, (x, y, 1));
+        dispatch(pass, &kernels.metrics, &self.metrics, offsets, (1, 1, 1));
+    }
+
+    /// Takes in what has come back; with `all`, waits for all of it, else only for what is too far behind. Returns how
+    /// many pairs must have room where lists did not fit: the iterations from that one on are waiting again.
+    pub fn collect(&mut self, context: &Context, all: bool) -> Result<Option<u32>, GpuError> {
+        context.poll()?;
+        while let Some(flight) = self.flights.front() {
+            let arrived = match flight.mapping.arrived() {
+                Some(result) => {
+                    result?;
+                    true
+                }
+                None if all || self.flights.len() > AHEAD => {
+                    context.wait()?;
+                    match self.flights.front().and_then(|flight| flight.mapping.arrived()) {
+                        Some(result) => {
+                            result?;
+                            true
+                        }
+                        None => return Err(GpuError::Lost("a readback never arrived".to_owned())),
+                    }
+                }
+                None => false,
+            };
+            if !arrived {
+                break;
+            }
+            let Some(flight) = self.flights.pop_front() else { break };
+            let words: Vec<u32> = pod_collect_to_vec(&copy(&flight.staging, flight.staging.size())?);
+            self.idle.push(flight.staging);
+            for (at, iteration) in flight.iterations.iter().enumerate() {
+                let words = &words[at * RING_WORDS..(at + 1) * RING_WORDS];
+                if words[8] == 0 {
+                    let pairs = words[9];
+                    return self.take_back(context, &flight.iterations[at..], pairs).map(Some);
+                }
+                self.finished.push_back(self.terms(words, iteration));
+            }
+        }
+        Ok(None)
+    }
+
+    /// Lists did not fit in an iteration: it and all that were recorded after it changed nothing, and wait again.
+    fn take_back(&mut self, context: &Context, failed: &[Iteration], pairs: u32) -> Result<u32, GpuError> {
+        context.wait()?;
+        let mut again = failed.to_vec();
+        let mut most = pairs;
+        for flight in std::mem::take(&mut self.flights) {
+            if let Some(result) = flight.mapping.arrived() {
+                result?;
+                let words: Vec<u32> = pod_collect_to_vec(&copy(&flight.staging, flight.staging.size())?);
+                most = most.max(words.get(9).copied().unwrap_or(0));
+            }
+            again.extend(flight.iterations);
+        }
+        again.append(&mut self.waiting);
+        self.waiting = again;
+        Ok(most)
+    }
+
+    fn terms(&self, words: &[u32], iteration: &Iteration) -> LossTerms {
+        let sum = |k: usize| f64::from(f32::from_bits(words[k]));
+        let Counts { samples, foreground, free, with_depth } = iteration.counts;
+        let per = |value: f64, count: usize| if count == 0 { 0.0 } else { value / count as f64 };
+        let count = f64::from(self.chain.size.gaussians.max(1));
+        let settings = &iteration.settings;
+        let terms = LossTerms {
+            l1: sum(0) / samples,
+            ssim: if settings.ssim_weight == 0.0 { 1.0 } else { sum(4) / samples },
+            depth_m: per(sum(2), with_depth),
+            free_alpha: per(sum(3), free),
+            isotropic_m: sum(5) / (3.0 * count),
+            opacity: sum(6) / count,
+            scale_m: sum(7) / (3.0 * count),
+            foreground_mse: per(sum(1), 3 * foreground),
+            total: 0.0,
+        };
+        terms.weighted(settings)
+    }
+
+    /// Terms of iterations that are over, in their order.
+    pub fn take_finished(&mut self) -> Vec<LossTerms> {
+        self.finished.drain(..).collect()
+    }
+
+    /// The loss of a keyframe and its gradient by every parameter, without a step: parameters and bands as the model has
+    /// them. `Err` holds how many pairs must have room where lists did not fit.
+    pub fn gradient(
+        &mut self,
+        context: &Context,
+        kernels: &Kernels,
+        (model, keyframes): (&DeviceModel, &mut Keyframes),
+        view: &TrainingView,
+        settings: &TrainingSettings,
+    ) -> Result<Result<(LossTerms, Vec<u8>, Vec<u8>), u32>, GpuError> {
+        keyframes.hold(context, kernels, view, self.recorded)?;
+        let iteration = Iteration {
+            keyframe: view.id(),
+            counts: Counts::new(view),
+            view: View::new(view.camera(), &settings.render, 0.0),
+            settings: *settings,
+        };
+        let out = context.storage("gradients", model.parameters.size())?;
+        let bands_out = context.storage("gradients", model.bands.size())?;
+        let group = kernels.gradient.bind(
+            context,
+            1,
+            &[
+                &self.jobs,
+                &self.views,
+                &model.parameters,
+                &model.bands,
+                &self.gradients,
+                &out,
+                &bands_out,
+                &self.chain.control,
+            ],
+        );
+        context.queue.write_buffer(&self.jobs, 0, bytes_of(&job(self.chain.size, model, 0, &iteration)));
+        context.queue.write_buffer(&self.views, 0, bytes_of(&iteration.view));
+        let mut encoder = context.encoder();
+        let mut pass = encoder.begin_compute_pass(&ComputePassDescriptor::default());
+        self.record(&mut pass, kernels, keyframes, &[0, 0], &iteration, (&kernels.gradient, &group));
+        drop(pass);
+        context.queue.submit([encoder.finish()]);
+        let [words, parameters, bands] =
+            context.read([(&self.ring, 4 * RING_WORDS as u64), (&out, out.size()), (&bands_out, bands_out.size())])?;
+        let words: Vec<u32> = pod_collect_to_vec(&words);
+        Ok(if words[8] == 0 { Err(words[9]) } else { Ok((self.terms(&words, &iteration), parameters, bands)) })
+    }
+}
+
+/// What the kernels are told of an iteration.
+fn job(size: Size, model: &DeviceModel, slot: u32, iteration: &Iteration) -> Job {
+    let settings = &iteration.settings;
+    let counts = &iteration.counts;
+    let per = |weight: f32, count: usize| if count == 0 { 0.0 } else { weight / count as f32 };
+    let (gaussians, deviations) = (size.gaussians.max(1) as f32, 3.0 * size.gaussians.max(1) as f32);
+    let degree = model.sh_degree.min(settings.render.sh_degree);
+    let limit = |sigma: f32| sigma.max(1e-9).ln();
+    let (low, high) = settings.sigma_limits_m.map_or((-20.0, 10.0), |(low, high)| (limit(low), limit(high)));
+    Job {
+        bands: crate::model::sh_rest_coefficients(degree) as u32,
+        band_rows: crate::model::sh_rest_rows(model.sh_degree) as u32,
+        slot,
+        l1: settings.l1_weight / counts.samples as f32,
+        ssim: settings.ssim_weight / counts.samples as f32,
+        depth: per(settings.depth_weight, counts.with_depth),
+        free: per(settings.free_weight, counts.free),
+        isotropic: settings.isotropic_weight / deviations,
+        opacity: settings.opacity_weight / gaussians,
+        scale: settings.scale_weight / deviations,
+        lr_bands: settings.lr_sh_rest,
+        lr_means: settings.lr_means,
+        lr_log_scales: settings.lr_log_scales,
+        lr_rotations: settings.lr_rotations,
+        lr_opacity: settings.lr_opacity,
+        lr_sh: settings.lr_sh,
+        beta1: settings.betas.0,
+        beta2: settings.betas.1,
+        epsilon: settings.epsilon,
+        log_scale_min: low,
+        log_scale_max: high,
+        ln_beta1: f64::from(settings.betas.0).ln() as f32,
+        ln_beta2: f64::from(settings.betas.1).ln() as f32,
+        ..size.job()
+    }
+}
