@@ -6,6 +6,7 @@ use std::path::Path;
 use serde::Serialize;
 use shared_types::config::Config;
 use shared_types::system::{SHARED_MEMORY_DIR, System};
+use splatting::gpu::{self, AdapterReport};
 
 use crate::cli::Doctor;
 use crate::exit::Exit;
@@ -54,6 +55,7 @@ pub fn run(arguments: &Doctor) -> anyhow::Result<Exit> {
         .into_iter()
         .chain(leftovers(&base, arguments.clean))
         .chain([ports(), real_time(), processor(), open_files()])
+        .chain(gpus())
         .collect();
     let text = if arguments.json { serde_json::to_string_pretty(&findings)? + "\n" } else { describe(&findings) };
     print(&text)?;
@@ -111,6 +113,59 @@ fn runtime_folder(base: &Path) -> Finding {
             format!("{}: {error}", base.display()),
             "make it writable for this user, or set XDG_RUNTIME_DIR to a folder on tmpfs",
         ),
+    }
+}
+
+/// Every adapter, with what it can do and a check of a second.
+fn gpus() -> Vec<Finding> {
+    let adapters = gpu::adapters();
+    if adapters.is_empty() {
+        return vec![Finding::new("gpu", Verdict::Ok, "no adapter: the CPU trains and scores", "")];
+    }
+    adapters.iter().map(gpu_finding).collect()
+}
+
+fn gpu_finding(adapter: &AdapterReport) -> Finding {
+    let subgroups = match adapter.subgroups {
+        Some((low, high)) if low == high => format!("subgroups of {low}"),
+        Some((low, high)) => format!("subgroups of {low} to {high}"),
+        None => "no subgroups".to_owned(),
+    };
+    let has = |what: bool, name: &str| if what { name.to_owned() } else { format!("no {name}") };
+    let described = format!(
+        "{} ({}, {}): {subgroups}, {}, {}, binds {} MiB of {} MiB buffers, {} storage buffers, {} KiB shared",
+        adapter.name,
+        adapter.interface,
+        adapter.driver,
+        has(adapter.float_atomics, "float atomics"),
+        has(adapter.timestamps, "timestamps"),
+        adapter.max_binding_bytes >> 20,
+        adapter.max_buffer_bytes >> 20,
+        adapter.storage_buffers,
+        adapter.workgroup_bytes >> 10,
+    );
+    match gpu::check(&adapter.name) {
+        Err(error) => Finding::new("gpu", Verdict::Advice, described, format!("it does not work here: {error}")),
+        Ok(check) => {
+            let found = format!(
+                "{described}; {:.0} iterations/s of {} Gaussians in {}x{}, images within {:.0e} of the CPU's, gradients 1 - {:.0e}",
+                check.iterations_per_s,
+                check.gaussians,
+                check.width,
+                check.height,
+                check.image_error,
+                1.0 - check.gradient_cosine,
+            );
+            if !check.is_correct() {
+                let advice = "its images or gradients are wrong: update the driver, and set trainer.backend and \
+                              scorer.backend to \"cpu\" until then";
+                Finding::new("gpu", Verdict::Advice, found, advice)
+            } else if adapter.is_software {
+                Finding::new("gpu", Verdict::Ok, found + "; software, which \"auto\" leaves alone", "")
+            } else {
+                Finding::new("gpu", Verdict::Ok, found, "")
+            }
+        }
     }
 }
 

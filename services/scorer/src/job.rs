@@ -5,7 +5,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use glam::{DQuat, DVec3, Quat, Vec3};
 use shared_types::messages::{CandidateScore, CandidateView, GaussianRow, ScoreRequest, VarianceMode};
-use splatting::{Camera, Engine, Gaussian, Gaussians, MomentsView, Pose, RenderSettings};
+use splatting::{Backend, BackendError, Camera, Gaussian, Gaussians, MomentsView, Pose, RenderSettings};
 
 use crate::logic::footprint::BoundingBox;
 use crate::logic::score::{Candidate, ScoreSettings, score};
@@ -124,10 +124,18 @@ impl Job {
         self.candidates.len()
     }
 
-    /// Scores every candidate on a model; `done` counts them. `None` when cancelled. The same bits for any number of
-    /// threads: each view is rendered and summed by one.
-    #[must_use]
-    pub fn run(&self, engine: &mut Engine, model: &Gaussians, cancel: &AtomicBool, done: &AtomicU64) -> Option<Scores> {
+    /// Scores every candidate on a model; `done` counts them. `None` when cancelled. On the CPU the same bits for any number
+    /// of threads: each view is rendered and summed by one.
+    ///
+    /// # Errors
+    /// When the back end fails.
+    pub fn run(
+        &self,
+        backend: &mut Backend,
+        model: &Gaussians,
+        cancel: &AtomicBool,
+        done: &AtomicU64,
+    ) -> Result<Option<Scores>, BackendError> {
         let views: Vec<MomentsView> = self
             .candidates
             .iter()
@@ -139,22 +147,25 @@ impl Job {
         let seen = Mutex::new(vec![Uncertainty::default(); views.len()]);
         // Early stop at T = 1e-4 (A8): the last of the transmittance carries the far surface.
         let settings = RenderSettings::default();
-        engine
-            .moments_batch(model, &views, &settings, cancel, |index, image| {
-                let moments = Moments {
-                    alpha: &image.alpha,
-                    first: &image.first,
-                    second: &image.second,
-                    offset_m: f64::from(image.reference_m),
-                };
-                let camera = &views[index].camera;
-                let found = uncertainty(self.mode, camera, &self.bounding_box, &moments, self.transparent_alpha);
-                if let Some(slot) = seen.lock().unwrap_or_else(PoisonError::into_inner).get_mut(index) {
-                    *slot = found;
-                }
-                done.fetch_add(1, Ordering::Relaxed);
-            })
-            .ok()?;
+        let rendered = backend.moments_batch(model, &views, &settings, cancel, |index, image| {
+            let moments = Moments {
+                alpha: &image.alpha,
+                first: &image.first,
+                second: &image.second,
+                offset_m: f64::from(image.reference_m),
+            };
+            let camera = &views[index].camera;
+            let found = uncertainty(self.mode, camera, &self.bounding_box, &moments, self.transparent_alpha);
+            if let Some(slot) = seen.lock().unwrap_or_else(PoisonError::into_inner).get_mut(index) {
+                *slot = found;
+            }
+            done.fetch_add(1, Ordering::Relaxed);
+        });
+        match rendered {
+            Ok(()) => {}
+            Err(BackendError::Cancelled) => return Ok(None),
+            Err(error) => return Err(error),
+        }
         let seen = seen.into_inner().unwrap_or_else(PoisonError::into_inner);
         let candidates: Vec<Candidate> = self
             .candidates
@@ -163,7 +174,7 @@ impl Job {
             .map(|(&(_, index, direction), seen)| Candidate { index, direction, seen })
             .collect();
         let (scores, uncertainty_p95) = score(&candidates, &self.visited, &self.settings);
-        Some(Scores { scores, uncertainty_p95 })
+        Ok(Some(Scores { scores, uncertainty_p95 }))
     }
 }
 
@@ -202,6 +213,7 @@ fn gaussian(row: &GaussianRow) -> Gaussian {
 #[cfg(test)]
 mod tests {
     use shared_types::frames::{Intrinsics, look_at};
+    use splatting::Engine;
 
     use super::*;
 
@@ -257,9 +269,9 @@ mod tests {
     fn run(request: &ScoreRequest, views: &[CandidateView], rows: &[GaussianRow], threads: usize) -> Scores {
         let held = Held::new(5, true, rows);
         let job = Job::from_request(request, views, 0.1).unwrap();
-        let mut engine = Engine::new(threads).unwrap();
+        let mut backend = Backend::from(Engine::new(threads).unwrap());
         let done = AtomicU64::new(0);
-        let scores = job.run(&mut engine, &held.model, &AtomicBool::new(false), &done).unwrap();
+        let scores = job.run(&mut backend, &held.model, &AtomicBool::new(false), &done).unwrap().unwrap();
         assert_eq!(done.into_inner(), job.candidates() as u64);
         scores
     }
@@ -337,7 +349,7 @@ mod tests {
     fn a_thousand_candidates_are_given_up_on_demand() {
         let held = Held::new(5, true, &wall(0.0, 8.0));
         let job = Job::from_request(&request(), &thousand(), 0.1).unwrap();
-        let mut engine = Engine::new(2).unwrap();
+        let mut backend = Backend::from(Engine::new(2).unwrap());
         let (cancel, done) = (AtomicBool::new(false), AtomicU64::new(0));
         std::thread::scope(|scope| {
             scope.spawn(|| {
@@ -346,7 +358,7 @@ mod tests {
                 }
                 cancel.store(true, Ordering::Relaxed);
             });
-            assert_eq!(job.run(&mut engine, &held.model, &cancel, &done), None);
+            assert_eq!(job.run(&mut backend, &held.model, &cancel, &done).unwrap(), None);
         });
         assert!(done.into_inner() < 1000);
     }

@@ -10,11 +10,18 @@ pub mod job;
 pub mod logic;
 pub mod measure;
 pub mod ports;
+pub mod renderer;
 pub mod state;
 pub mod worker;
 
 use std::collections::VecDeque;
 
+use crate::holdings::{Holdings, Lookup};
+use crate::job::Job;
+use crate::ports::{Asked, Ports};
+use crate::renderer::Renderer;
+use crate::state::{Event, State, due_ns};
+use crate::worker::{Scored, Worker, WorkerGone};
 use anyhow::{Context as _, anyhow};
 use shared_types::bus::ReplyAddress;
 use shared_types::config::Config;
@@ -22,13 +29,6 @@ use shared_types::config::trainer::DeclaredCost;
 use shared_types::messages::{CandidateScore, ScoreReply, ScoreStatus, ServiceState};
 use shared_types::payload::pack_text;
 use shared_types::service::{Context, HealthReport, Service, ServiceError, Step, StopAnswer};
-use splatting::Engine;
-
-use crate::holdings::{Holdings, Lookup};
-use crate::job::Job;
-use crate::ports::{Asked, Ports};
-use crate::state::{Event, State, due_ns};
-use crate::worker::{Scored, Worker, WorkerGone};
 
 /// Answers kept for requests that are sent again.
 const ANSWERS_KEPT: usize = 8;
@@ -93,16 +93,18 @@ impl Scorer {
             0 => std::thread::available_parallelism().map_or(1, usize::from),
             n => n as usize,
         };
-        let mut engine = Engine::new(threads)?;
+        let mut renderer = Renderer::new(&config.scorer, threads)?;
         let ms_per_candidate = match config.scorer.ms_per_candidate {
             _ if !lockstep => 0.0,
             DeclaredCost::Fixed(ms) => ms,
-            DeclaredCost::Word(_) => measure::ms_per_candidate(&mut engine, config.model.width, config.model.height)
-                .map_err(|reason| anyhow!("scorer.ms_per_candidate = \"auto\" cannot be measured: {reason}"))?,
+            DeclaredCost::Word(_) => {
+                measure::ms_per_candidate(renderer.backend(), config.model.width, config.model.height)
+                    .map_err(|reason| anyhow!("scorer.ms_per_candidate = \"auto\" cannot be measured: {reason}"))?
+            }
         };
         Ok(Self {
             ports,
-            worker: Worker::start(engine).context("cannot start the scoring thread")?,
+            worker: Worker::start(renderer).context("cannot start the scoring thread")?,
             state: State::Idle,
             holdings: Holdings::default(),
             wanted: VecDeque::new(),

@@ -6,7 +6,7 @@ use std::time::Instant;
 use glam::{DVec3, Quat, Vec3};
 use shared_types::frames::{Intrinsics, look_at};
 use shared_types::messages::{CandidateView, ScoreRequest, VarianceMode};
-use splatting::{Engine, Gaussian, Gaussians};
+use splatting::{Backend, Gaussian, Gaussians};
 
 use crate::job::Job;
 
@@ -16,8 +16,8 @@ const CANDIDATES: u32 = 16;
 /// Milliseconds a candidate on this machine: a sphere of 100,000 Gaussians in images of this size.
 ///
 /// # Errors
-/// When an image of this size cannot be scored.
-pub fn ms_per_candidate(engine: &mut Engine, width: u32, height: u32) -> Result<f64, String> {
+/// When an image of this size cannot be scored, or the back end fails.
+pub fn ms_per_candidate(backend: &mut Backend, width: u32, height: u32) -> Result<f64, String> {
     let model: Gaussians = (0..GAUSSIANS).map(sphere_gaussian).collect();
     let camera = Intrinsics::from_hfov(width, height, 1.204);
     let request = ScoreRequest {
@@ -43,10 +43,13 @@ pub fn ms_per_candidate(engine: &mut Engine, width: u32, height: u32) -> Result<
         })
         .collect();
     let job = Job::from_request(&request, &views, 0.1)?;
-    let mut run = || job.run(engine, &model, &AtomicBool::new(false), &AtomicU64::new(0));
-    run();
+    let mut run = || {
+        let result = job.run(backend, &model, &AtomicBool::new(false), &AtomicU64::new(0));
+        result.map(|_| ()).map_err(|error| error.to_string())
+    };
+    run()?;
     let started = Instant::now();
-    run();
+    run()?;
     Ok(started.elapsed().as_secs_f64() * 1e3 / f64::from(CANDIDATES))
 }
 

@@ -5,10 +5,9 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::mpsc::{Receiver, SyncSender, TryRecvError, sync_channel};
 use std::thread::JoinHandle;
 
-use rustix::time::{ClockId, clock_gettime};
-use splatting::Engine;
-
 use crate::job::{Held, Job, Scores};
+use crate::renderer::Renderer;
+use rustix::time::{ClockId, clock_gettime};
 
 /// A scoring that is done.
 #[derive(Debug, Clone, PartialEq)]
@@ -19,7 +18,7 @@ pub struct Scored {
     pub cpu_ns: u64,
 }
 
-/// The thread is gone: it panicked.
+/// The thread is gone: it panicked, or nothing could render any more.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[error("the scoring thread ended unexpectedly; its last words are in the log, and a restarted scorer computes again")]
 pub struct WorkerGone;
@@ -39,7 +38,7 @@ impl Worker {
     ///
     /// # Errors
     /// When the system refuses a thread.
-    pub fn start(mut engine: Engine) -> std::io::Result<Self> {
+    pub fn start(mut renderer: Renderer) -> std::io::Result<Self> {
         let (jobs, job_receiver) = sync_channel::<(Job, Held)>(1);
         let (result_sender, results) = sync_channel(1);
         let (cancel, work) = (Arc::new(AtomicBool::new(false)), Arc::new(AtomicU64::new(0)));
@@ -47,7 +46,7 @@ impl Worker {
         let thread = std::thread::Builder::new().name("score".to_owned()).spawn(move || {
             while let Ok((job, held)) = job_receiver.recv() {
                 let before = process_cpu_ns();
-                let Some(scores) = job.run(&mut engine, &held.model, &cancelled, &done) else { return };
+                let Some(scores) = renderer.score(&job, &held.model, &cancelled, &done) else { return };
                 let scored = Scored { scores, cpu_ns: process_cpu_ns().saturating_sub(before) };
                 if result_sender.send(scored).is_err() {
                     return;

@@ -7,6 +7,7 @@
 
 #![expect(clippy::needless_range_loop, reason = "kernels index several vectors by one counter; see simd::build")]
 
+mod backend;
 mod backward;
 mod blend;
 pub mod bytes;
@@ -42,6 +43,7 @@ mod training;
 mod view;
 mod workers;
 
+pub use backend::{Backend, BackendError, BackendKind, Training};
 pub use camera::{Camera, Pose, RenderSettings};
 pub use densify::{
     DefaultSettings, Densifier, DensifierState, DensifyError, DensifyReport, McmcSettings, Relocation, Strategy,

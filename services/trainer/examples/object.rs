@@ -106,9 +106,9 @@ fn main() -> anyhow::Result<()> {
         let begun = started.elapsed().as_secs_f64();
         let untrained = psnr(&mut session, &truths);
         let started = Instant::now();
-        while !session.advance(20, || ()) {}
+        while !session.advance(20, || ())? {}
         seconds += started.elapsed().as_secs_f64();
-        session.finish();
+        session.finish()?;
         let progress = session.progress();
         iterations += progress.iterations;
         let trained = psnr(&mut session, &truths);
@@ -184,10 +184,12 @@ fn truth(scene: &Scene, threads: &Threads, pose: &Pose, intrinsics: Intrinsics, 
 
 /// PSNR of held-out views at R and at the near radius, dB.
 fn psnr(session: &mut Session, truths: &[Truth]) -> (f64, f64) {
-    let (engine, model) = session.engine_and_model();
+    let (backend, model) = session.backend_and_model();
     let mut image = Rendered::default();
     let mut of = |truth: &Truth| {
-        engine.render(model, &truth.camera, &RenderSettings::default(), &mut image);
+        if backend.render(model, &truth.camera, &RenderSettings::default(), &mut image).is_err() {
+            return f64::NAN;
+        }
         metrics::psnr(&image.color, &truth.color, Some(&truth.mask)).unwrap_or(f64::NAN)
     };
     (mean(truths, false, &mut of), mean(truths, true, &mut of))

@@ -65,7 +65,7 @@ impl Checkpoint {
     }
 }
 
-/// The bytes of a checkpoint of a session.
+/// The bytes of a checkpoint of a session, as of its last [`Session::sync`].
 #[must_use]
 pub fn to_bytes(session: &Session) -> Vec<u8> {
     let progression = &session.progression;
@@ -94,7 +94,7 @@ pub fn to_bytes(session: &Session) -> Vec<u8> {
             w.f32(footprint);
         });
     });
-    w.blob(&splatting::checkpoint::encode(&session.model, &session.optimiser));
+    w.blob(&splatting::checkpoint::encode(session.training.model(), session.training.optimiser()));
     let mut bytes = w.into_bytes();
     let sum = checksum(&bytes);
     bytes.extend_from_slice(&sum.to_le_bytes());

@@ -5,6 +5,7 @@
 //! Everything is on disk before it is told: a restarted trainer goes on from its newest checkpoint.
 #![forbid(unsafe_code)]
 
+pub mod backend;
 pub mod checkpoint;
 pub mod keyframes;
 pub mod logic;
@@ -26,7 +27,7 @@ use shared_types::folder::MissionFolder;
 use shared_types::messages::ServiceState;
 use shared_types::service::{Context, HealthReport, Service, ServiceError, Step, StopAnswer};
 use shared_types::{NS_PER_S, ns_from_s};
-use splatting::Engine;
+use splatting::Training;
 
 use crate::ports::{Outcome, Ports};
 use crate::requests::{Requests, Verdict};
@@ -89,11 +90,13 @@ impl Trainer {
             0 => std::thread::available_parallelism().map_or(1, usize::from),
             n => n as usize,
         };
-        let mut engine = Engine::new(threads)?;
+        let model_folder = folder.model_path();
+        let backend = backend::choose(&config.trainer, &model_folder, threads)?;
+        let mut training = Training::new(backend);
         let iterations_per_s = match config.trainer.iterations_per_s {
             _ if !lockstep => f64::INFINITY,
             DeclaredCost::Fixed(rate) => rate,
-            DeclaredCost::Word(_) => measure::iterations_per_s(&mut engine, config.model.width, config.model.height),
+            DeclaredCost::Word(_) => measure::iterations_per_s(&mut training, config.model.width, config.model.height)?,
         };
         let pace = if lockstep {
             Pace::Counted {
@@ -103,8 +106,7 @@ impl Trainer {
         } else {
             Pace::OnDemand
         };
-        let model_folder = folder.model_path();
-        let session = Session::new(config.trainer.clone(), config.model.clone(), engine);
+        let session = Session::new(config.trainer.clone(), config.model.clone(), training.into_backend());
         let worker = Worker::start(session, Box::new(folder), model_folder, config.trainer.slice_iterations, pace)
             .context("cannot start the training thread")?;
         Ok(Self {
@@ -240,6 +242,10 @@ impl Trainer {
                 self.requests.wanted.pop_front();
                 self.progress.iterations = 0;
                 self.state = self.state.on(Event::Failed);
+            }
+            Output::Broken { reason } => {
+                // A restarted trainer goes on from the newest checkpoint, and knows what happened.
+                return Err(ServiceError::Other(format!("the back end failed: {reason}")));
             }
             Output::Ready { .. } | Output::Stopped => {}
         }

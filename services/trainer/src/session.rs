@@ -8,7 +8,7 @@ use std::collections::{BTreeMap, VecDeque};
 use shared_types::config::trainer::BirthShape;
 use shared_types::config::{ModelConfig, TrainerConfig};
 use shared_types::messages::GaussianRow;
-use splatting::{Engine, Gaussian, Gaussians, Optimiser, TrainingSettings};
+use splatting::{Backend, BackendError, Gaussian, Gaussians, Optimiser, Training, TrainingSettings};
 
 use crate::keyframes::{self, KeyframeError, KeyframeSource, SmallKeyframe, View};
 use crate::logic::rounds::{LossHistory, means_learning_rate, window_views};
@@ -23,6 +23,17 @@ use splatting::rgbd::voxels::{VoxelGrid, voxel_edge_m};
 pub(crate) const PSNR_IMAGES: usize = 100;
 /// PSNR of a foreground without error, dB: what 16 bits could show.
 const PSNR_MAX_DB: f64 = 100.0;
+
+/// Why a round cannot begin.
+#[derive(Debug, thiserror::Error)]
+pub enum SessionError {
+    /// A keyframe cannot be read; the session is as before.
+    #[error(transparent)]
+    Keyframe(#[from] KeyframeError),
+    /// The back end failed: training since the last [`Session::sync`] is lost.
+    #[error(transparent)]
+    Backend(#[from] BackendError),
+}
 
 /// A round under work.
 #[derive(Debug, Clone, PartialEq)]
@@ -78,9 +89,9 @@ pub struct Snapshot {
 pub struct Session {
     config: TrainerConfig,
     model_config: ModelConfig,
-    engine: Engine,
-    pub(crate) model: Gaussians,
-    pub(crate) optimiser: Optimiser,
+    pub(crate) training: Training,
+    /// Whether the views of steps whose losses are not known yet have foreground.
+    have_foreground: VecDeque<bool>,
     pub(crate) progression: Progression,
     /// Keyframes prepared for training, and the clip box that their masks are for.
     views: BTreeMap<u64, View>,
@@ -90,7 +101,7 @@ pub struct Session {
 impl core::fmt::Debug for Session {
     fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
         f.debug_struct("Session")
-            .field("gaussians", &self.model.len())
+            .field("gaussians", &self.model().len())
             .field("total_iterations", &self.progression.total_iterations)
             .finish_non_exhaustive()
     }
@@ -99,13 +110,12 @@ impl core::fmt::Debug for Session {
 impl Session {
     /// A session that has seen nothing.
     #[must_use]
-    pub fn new(config: TrainerConfig, model_config: ModelConfig, engine: Engine) -> Self {
+    pub fn new(config: TrainerConfig, model_config: ModelConfig, backend: impl Into<Backend>) -> Self {
         Self {
             config,
             model_config,
-            engine,
-            model: Gaussians::new(),
-            optimiser: Optimiser::new(),
+            training: Training::new(backend),
+            have_foreground: VecDeque::new(),
             progression: Progression::new(),
             views: BTreeMap::new(),
             views_clip: None,
@@ -118,21 +128,36 @@ impl Session {
         &self.config
     }
 
-    /// The model as it is.
+    /// What trains.
+    #[must_use]
+    pub fn backend(&self) -> &Backend {
+        self.training.backend()
+    }
+
+    /// The model, as of the last [`Session::sync`].
     #[must_use]
     pub fn model(&self) -> &Gaussians {
-        &self.model
+        self.training.model()
     }
 
-    /// The model alone.
-    #[must_use]
+    /// The model alone, as of the last [`Session::sync`].
     pub fn into_model(self) -> Gaussians {
-        self.model
+        self.training.into_model()
     }
 
-    /// The renderer, for looking at the model.
-    pub fn engine_and_model(&mut self) -> (&mut Engine, &Gaussians) {
-        (&mut self.engine, &self.model)
+    /// The renderer, for looking at the model of the last [`Session::sync`].
+    pub fn backend_and_model(&mut self) -> (&mut Backend, &Gaussians) {
+        self.training.backend_and_model()
+    }
+
+    /// Brings the model here from wherever it is trained: before it is looked at, published or written. Between rounds it
+    /// is here.
+    ///
+    /// # Errors
+    /// When the back end failed; what is here is then older.
+    pub fn sync(&mut self) -> Result<(), BackendError> {
+        self.training.sync()?;
+        self.take_losses()
     }
 
     /// Rounds that are over, in their order.
@@ -155,7 +180,7 @@ impl Session {
             Some(round) => Progress {
                 iterations: round.iterations,
                 total_iterations,
-                gaussians: self.model.len() as u64,
+                gaussians: self.model().len() as u64,
                 loss: round.losses.mean_of_last(),
                 psnr_train_db: round.psnr_db.iter().sum::<f64>() / round.psnr_db.len().max(1) as f64,
             },
@@ -166,8 +191,8 @@ impl Session {
     /// Begins a round: prunes what is wrong, makes room, and inserts the keyframes that are new.
     ///
     /// # Errors
-    /// When a keyframe cannot be read; the session is then as before.
-    pub fn begin(&mut self, spec: RoundSpec, source: &mut dyn KeyframeSource) -> Result<(), KeyframeError> {
+    /// When a keyframe cannot be read, or the back end failed.
+    pub fn begin(&mut self, spec: RoundSpec, source: &mut dyn KeyframeSource) -> Result<(), SessionError> {
         let clip = self.clip(&spec);
         let mut fresh = Vec::new();
         for &id in &spec.keyframes {
@@ -177,7 +202,7 @@ impl Session {
         }
         self.prepare_views(&spec, &fresh, source)?;
 
-        self.prune(&spec);
+        self.prune(&spec)?;
         if self.progression.grid.is_none() {
             let focal = fresh.first().map_or(1.0, |(_, keyframe)| f64::from(keyframe.camera.fx));
             let edge = if self.config.voxel_m > 0.0 {
@@ -204,7 +229,7 @@ impl Session {
             }
         }
         self.progression.inserted.sort_unstable();
-        self.append(born);
+        self.append(born)?;
 
         let window = self.window(&spec).len() as u32;
         self.progression.active = Some(ActiveRound {
@@ -230,31 +255,38 @@ impl Session {
 
     /// Trains at most `iterations` more, and tells whether the round is over: at its length, or flat where that ends it.
     /// `on_iteration` is called after each.
-    pub fn advance(&mut self, iterations: u32, mut on_iteration: impl FnMut()) -> bool {
-        let Some(spec) = self.active().cloned() else { return true };
+    ///
+    /// # Errors
+    /// When the back end failed.
+    pub fn advance(&mut self, iterations: u32, mut on_iteration: impl FnMut()) -> Result<bool, BackendError> {
+        let Some(spec) = self.active().cloned() else { return Ok(true) };
         let window = self.window(&spec);
         for _ in 0..iterations {
-            if self.is_over() || !self.iterate(&spec, &window) {
-                return true;
+            if self.is_over() || !self.iterate(&spec, &window)? {
+                return Ok(true);
             }
             on_iteration();
         }
-        self.is_over()
+        Ok(self.is_over())
     }
 
     /// Ends the round: prunes once more, so that what is scored and kept is clean.
-    pub fn finish(&mut self) -> Option<FinishedRound> {
+    ///
+    /// # Errors
+    /// When the back end failed.
+    pub fn finish(&mut self) -> Result<Option<FinishedRound>, BackendError> {
+        let Some(spec) = self.active().cloned() else { return Ok(None) };
+        self.sync()?;
         let progress = self.progress();
-        let spec = self.active().cloned()?;
-        self.prune(&spec);
+        self.prune(&spec)?;
         self.progression.active = None;
         let finished = FinishedRound {
             generation: generation(progress.total_iterations, spec.round, true),
-            progress: Progress { gaussians: self.model.len() as u64, ..progress },
+            progress: Progress { gaussians: self.model().len() as u64, ..progress },
             spec,
         };
         self.progression.finished.push(finished.clone());
-        Some(finished)
+        Ok(Some(finished))
     }
 
     /// Generation of a snapshot or checkpoint taken now, and whether it is of a round's end; `None` before the first round.
@@ -265,7 +297,8 @@ impl Session {
         Some((generation(self.progression.total_iterations, round, is_final), is_final))
     }
 
-    /// The model as it is published: live during a round, final between rounds; `None` before the first.
+    /// The model as it is published: live during a round, final between rounds; `None` before the first. Of the last
+    /// [`Session::sync`].
     #[must_use]
     pub fn snapshot(&self) -> Option<Snapshot> {
         let (generation, is_final) = self.generation_now()?;
@@ -273,7 +306,7 @@ impl Session {
             generation,
             total_iterations: self.progression.total_iterations,
             is_final,
-            rows: self.model.iter().map(|gaussian| row(&gaussian)).collect(),
+            rows: self.model().iter().map(|gaussian| row(&gaussian)).collect(),
             spec: self.active().or(self.finished().last().map(|round| &round.spec))?.clone(),
         })
     }
@@ -288,27 +321,38 @@ impl Session {
     }
 
     /// One step; false where there is nothing to train on.
-    fn iterate(&mut self, spec: &RoundSpec, window: &[usize]) -> bool {
+    fn iterate(&mut self, spec: &RoundSpec, window: &[usize]) -> Result<bool, BackendError> {
         let settings = self.settings(spec);
-        let Some(round) = &mut self.progression.active else { return false };
+        let Some(round) = &mut self.progression.active else { return Ok(false) };
         let view = round
             .order
             .next_view()
             .and_then(|k| window.get(k as usize))
             .and_then(|&index| spec.keyframes.get(index))
             .and_then(|id| self.views.get(id));
-        let Some(view) = view else { return false };
-        let terms = self.engine.train_step(&mut self.model, &mut self.optimiser, &view.training, &settings);
+        let Some(view) = view else { return Ok(false) };
+        self.training.step(&view.training, &settings)?;
+        self.have_foreground.push_back(view.training.foreground_pixels() > 0);
         round.iterations += 1;
         self.progression.total_iterations += 1;
-        round.losses.push(terms.total);
-        if view.training.foreground_pixels() > 0 {
-            if round.psnr_db.len() == PSNR_IMAGES {
-                round.psnr_db.pop_front();
+        self.take_losses()?;
+        Ok(true)
+    }
+
+    /// Takes in the losses that are known by now.
+    fn take_losses(&mut self) -> Result<(), BackendError> {
+        let finished = self.training.finished()?;
+        let Some(round) = &mut self.progression.active else { return Ok(()) };
+        for terms in finished {
+            round.losses.push(terms.total);
+            if self.have_foreground.pop_front() == Some(true) {
+                if round.psnr_db.len() == PSNR_IMAGES {
+                    round.psnr_db.pop_front();
+                }
+                round.psnr_db.push_back(terms.foreground_psnr_db().min(PSNR_MAX_DB));
             }
-            round.psnr_db.push_back(terms.foreground_psnr_db().min(PSNR_MAX_DB));
         }
-        true
+        Ok(())
     }
 
     fn settings(&self, spec: &RoundSpec) -> TrainingSettings {
@@ -372,7 +416,8 @@ impl Session {
         Ok(())
     }
 
-    fn prune(&mut self, spec: &RoundSpec) {
+    fn prune(&mut self, spec: &RoundSpec) -> Result<(), BackendError> {
+        self.sync()?;
         let edge = self.progression.grid.as_ref().map_or(0.0, VoxelGrid::edge_m);
         let rules = PruneRules {
             clip: self.clip(spec),
@@ -388,28 +433,32 @@ impl Session {
             .filter_map(|id| self.views.get(id))
             .map(|view| DepthView { camera: &view.camera, depth_m: &view.depth_m })
             .collect();
-        let kept = prune::keep(&self.model, &views, &rules);
-        self.retain(&kept);
+        let kept = prune::keep(self.training.model(), &views, &rules);
+        self.retain(&kept)
     }
 
-    fn retain(&mut self, kept: &[bool]) {
-        self.optimiser.fit(&self.model);
-        self.model.retain(|i| kept.get(i).copied().unwrap_or(false));
-        self.optimiser.retain(|i| kept.get(i).copied().unwrap_or(false));
+    fn retain(&mut self, kept: &[bool]) -> Result<(), BackendError> {
+        let (model, optimiser) = self.training.parts_mut()?;
+        optimiser.fit(model);
+        model.retain(|i| kept.get(i).copied().unwrap_or(false));
+        optimiser.retain(|i| kept.get(i).copied().unwrap_or(false));
+        Ok(())
     }
 
     /// Adds newborn Gaussians, making room at the cap, and brings neighbours together in memory.
-    fn append(&mut self, mut born: Vec<Gaussian>) {
+    fn append(&mut self, mut born: Vec<Gaussian>) -> Result<(), BackendError> {
         let cap = self.model_config.max_gaussians as usize;
         born.truncate(cap);
-        let kept = prune::keep_most_contributing(&self.model, cap - born.len());
-        self.retain(&kept);
+        let kept = prune::keep_most_contributing(self.training.model(), cap - born.len());
+        self.retain(&kept)?;
         self.progression.next_gaussian_id += born.len() as u64;
-        self.model.extend(born);
-        self.optimiser.fit(&self.model);
-        let order = self.model.morton_order();
-        self.model.permute(&order);
-        self.optimiser.permute(&order);
+        let (model, optimiser) = self.training.parts_mut()?;
+        model.extend(born);
+        optimiser.fit(model);
+        let order = model.morton_order();
+        model.permute(&order);
+        optimiser.permute(&order);
+        Ok(())
     }
 
     pub(crate) fn reset(&mut self) {
@@ -417,7 +466,9 @@ impl Session {
     }
 
     pub(crate) fn restore(&mut self, model: Gaussians, optimiser: Optimiser, progression: Progression) {
-        (self.model, self.optimiser, self.progression) = (model, optimiser, progression);
+        self.training.restore(model, optimiser);
+        self.have_foreground.clear();
+        self.progression = progression;
     }
 }
 

@@ -12,10 +12,13 @@ use std::time::{Duration, Instant};
 
 use shared_types::folder::write_atomic;
 
+use splatting::BackendError;
+
+use crate::backend;
 use crate::checkpoint;
 use crate::keyframes::KeyframeSource;
 use crate::round::{FinishedRound, Progress, RoundSpec};
-use crate::session::{Session, Snapshot};
+use crate::session::{Session, SessionError, Snapshot};
 
 /// Results that may wait to be published: bounds how far the thread runs ahead of the mission clock, and its memory.
 const AHEAD: usize = 8;
@@ -67,6 +70,11 @@ pub enum Output {
         /// Which.
         round: u32,
         /// Why.
+        reason: String,
+    },
+    /// The back end failed. What was trained since the newest checkpoint is lost, and the thread has ended.
+    Broken {
+        /// How.
         reason: String,
     },
     /// The thread was asked to stop and has written what it had.
@@ -170,7 +178,7 @@ impl Worker {
         let deadline = Instant::now() + patience;
         loop {
             match self.outputs.recv_timeout(deadline.saturating_duration_since(Instant::now())) {
-                Ok(Output::Stopped) | Err(RecvTimeoutError::Disconnected) => break,
+                Ok(Output::Stopped | Output::Broken { .. }) | Err(RecvTimeoutError::Disconnected) => break,
                 Ok(_) => {}
                 Err(RecvTimeoutError::Timeout) => return false,
             }
@@ -179,8 +187,19 @@ impl Worker {
     }
 }
 
-/// The service has gone; nobody waits for results.
-struct Unwanted;
+/// Why the thread ends.
+enum End {
+    /// The service has gone, or wants nothing any more.
+    Unwanted,
+    /// The back end failed.
+    Broken(BackendError),
+}
+
+impl From<BackendError> for End {
+    fn from(error: BackendError) -> Self {
+        Self::Broken(error)
+    }
+}
 
 struct Thread {
     session: Session,
@@ -195,16 +214,25 @@ struct Thread {
 impl Thread {
     fn run(&mut self, jobs: &Receiver<RoundSpec>) {
         let ready = self.look_at_folder();
-        let mut alive = self.send(ready).is_ok();
-        while alive && let Ok(spec) = jobs.recv() {
-            alive = self.round(spec).is_ok();
+        let mut going = self.send(ready);
+        while going.is_ok()
+            && let Ok(spec) = jobs.recv()
+        {
+            going = self.round(spec);
         }
+        let last = match going {
+            Err(End::Broken(error)) => {
+                backend::record_failure(&self.model_folder, &error);
+                Output::Broken { reason: error.to_string() }
+            }
+            Ok(()) | Err(End::Unwanted) => Output::Stopped,
+        };
         // Nobody may be left to hear it.
-        self.outputs.send(Output::Stopped).ok();
+        self.outputs.send(last).ok();
     }
 
-    fn send(&self, output: Output) -> Result<(), Unwanted> {
-        self.outputs.send(output).map_err(|_gone| Unwanted)
+    fn send(&self, output: Output) -> Result<(), End> {
+        self.outputs.send(output).map_err(|_gone| End::Unwanted)
     }
 
     fn look_at_folder(&mut self) -> Output {
@@ -233,19 +261,23 @@ impl Thread {
         }
     }
 
-    fn round(&mut self, spec: RoundSpec) -> Result<(), Unwanted> {
+    fn round(&mut self, spec: RoundSpec) -> Result<(), End> {
         let round = spec.round;
         let done_before = self.session.active().is_none()
             && self.session.finished().last().is_some_and(|finished| finished.spec == spec);
         if !done_before {
-            if let Err(error) = self.begin(spec) {
-                return self.send(Output::Failed { round, reason: error.to_string() });
+            match self.begin(spec) {
+                Ok(()) => {}
+                Err(SessionError::Backend(error)) => return Err(error.into()),
+                Err(SessionError::Keyframe(error)) => {
+                    return self.send(Output::Failed { round, reason: error.to_string() });
+                }
             }
             self.signals.work.fetch_add(1, Ordering::Relaxed);
             if !self.train()? {
-                return Err(Unwanted);
+                return Err(End::Unwanted);
             }
-            self.session.finish();
+            self.session.finish()?;
         }
         // On disk before anybody hears of it.
         if let Err(error) = checkpoint::write(&self.model_folder, &self.session) {
@@ -258,9 +290,9 @@ impl Thread {
         }
     }
 
-    fn begin(&mut self, spec: RoundSpec) -> Result<(), crate::keyframes::KeyframeError> {
+    fn begin(&mut self, spec: RoundSpec) -> Result<(), SessionError> {
         match self.session.active() {
-            Some(active) if *active == spec => return self.session.resume(&mut *self.source),
+            Some(active) if *active == spec => return Ok(self.session.resume(&mut *self.source)?),
             Some(_) => {
                 tracing::warn!(
                     round = spec.round,
@@ -278,26 +310,26 @@ impl Thread {
     }
 
     /// Trains to the round's end; false when it was asked to stop before.
-    fn train(&mut self) -> Result<bool, Unwanted> {
+    fn train(&mut self) -> Result<bool, End> {
         loop {
             let before = self.session.progress().iterations;
             let work = &self.signals.work;
             let over = self.session.advance(self.slice_iterations, || {
                 work.fetch_add(1, Ordering::Relaxed);
-            });
+            })?;
             let progress = self.session.progress();
             if !over && self.is_due(before, progress.iterations, false) {
-                self.checkpoint();
+                self.checkpoint()?;
             }
             if self.signals.stop.load(Ordering::Relaxed) {
-                self.checkpoint();
+                self.checkpoint()?;
                 return Ok(false);
             }
             if progress.iterations == before {
                 return Ok(true);
             }
             let wanted = !over && self.is_due(before, progress.iterations, true);
-            let snapshot = if wanted { self.session.snapshot() } else { None };
+            let snapshot = if wanted { self.synced()?.snapshot() } else { None };
             self.send(Output::Slice { progress, over, snapshot })?;
             if over {
                 return Ok(true);
@@ -324,10 +356,17 @@ impl Thread {
         }
     }
 
-    fn checkpoint(&self) {
+    fn checkpoint(&mut self) -> Result<(), End> {
+        self.synced()?;
         if let Err(error) = checkpoint::write(&self.model_folder, &self.session) {
             tracing::warn!(%error, "cannot write a checkpoint; training goes on");
         }
+        Ok(())
+    }
+
+    fn synced(&mut self) -> Result<&Session, BackendError> {
+        self.session.sync()?;
+        Ok(&self.session)
     }
 }
 

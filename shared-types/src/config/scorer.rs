@@ -3,7 +3,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::trainer::DeclaredCost;
+use super::trainer::{BackendWord, DeclaredCost};
 
 /// Section `[scorer]`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -13,13 +13,23 @@ pub struct ScorerConfig {
     pub ms_per_candidate: DeclaredCost,
     /// Worker threads; 0: one per core.
     pub threads: u32,
+    /// What renders: `"auto"` (a GPU where there is a real one, else the CPU), `"cpu"` or `"gpu"`.
+    pub backend: BackendWord,
+    /// Name of the GPU, or a part of it (`vantage doctor` lists them); empty: the best that is not software.
+    pub adapter: String,
     /// Pixels with less accumulated alpha than this are transparent: nothing is known there (0.1 in the paper).
     pub transparent_alpha: f64,
 }
 
 impl Default for ScorerConfig {
     fn default() -> Self {
-        Self { ms_per_candidate: DeclaredCost::Fixed(4.0), threads: 0, transparent_alpha: 0.1 }
+        Self {
+            ms_per_candidate: DeclaredCost::Fixed(4.0),
+            threads: 0,
+            backend: BackendWord::Auto,
+            adapter: String::new(),
+            transparent_alpha: 0.1,
+        }
     }
 }
 

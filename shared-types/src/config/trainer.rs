@@ -23,6 +23,19 @@ pub enum AutoWord {
     Auto,
 }
 
+/// What renders and trains.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum BackendWord {
+    /// A GPU where there is a real one, else the CPU.
+    #[default]
+    Auto,
+    /// The CPU.
+    Cpu,
+    /// A GPU, or an error.
+    Gpu,
+}
+
 /// Which pixels the losses see (A31).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
@@ -51,6 +64,11 @@ pub struct TrainerConfig {
     pub iterations_per_s: DeclaredCost,
     /// Worker threads; 0: one per core.
     pub threads: u32,
+    /// What trains: `"auto"` (a GPU where there is a real one, else the CPU), `"cpu"` or `"gpu"`. Runs repeat bit for bit
+    /// on the CPU only.
+    pub backend: BackendWord,
+    /// Name of the GPU, or a part of it (`vantage doctor` lists them); empty: the best that is not software.
+    pub adapter: String,
     /// Iterations between two looks at stop, flattening and what is due.
     pub slice_iterations: u32,
     /// Mission time between two checkpoints, seconds (at most 10 s of training may be lost).
@@ -134,6 +152,8 @@ impl Default for TrainerConfig {
         Self {
             iterations_per_s: DeclaredCost::Fixed(80.0),
             threads: 0,
+            backend: BackendWord::Auto,
+            adapter: String::new(),
             slice_iterations: 20,
             checkpoint_period_s: 10.0,
             snapshot_period_s: 1.0,

@@ -216,7 +216,7 @@ impl Metrics {
             preset: Some(config.mission.preset.clone()).filter(|preset| !preset.is_empty()),
             strategy: name_of(&config.planner.strategy),
             selector: name_of(&config.planner.selector),
-            backend: Some("cpu".to_owned()),
+            backend: None,
             version: Some(config.mission.version.clone()).filter(|version| !version.is_empty()),
             end_reason: journal.end_reason.clone().or_else(|| flight.end_reason.clone()),
             estimator: if simulated { name_of(&config.simulator.estimator) } else { None },

@@ -18,6 +18,7 @@ use shared_types::folder::{FolderError, MissionFolder, write_atomic};
 use shared_types::frames::Pose;
 use splatting::Gaussians;
 use splatting::formats::Format;
+use trainer::backend::Record;
 
 use crate::cli::Evaluate;
 use crate::exit::{Exit, Refusal};
@@ -86,6 +87,7 @@ pub fn measure(
     let own = folder.model_path().join("model.ply");
     let gaussians = read_model(model.unwrap_or(&own))?;
     let mut metrics = Metrics::of_folder(config, &flight::read(folder)?, &journal::read(&folder.journal_path())?);
+    metrics.mission.backend = Some(Record::read(&folder.model_path()).backend).filter(|name| !name.is_empty());
     metrics.live.gaussians = Some(gaussians.len());
     metrics.memory.insert("model_mb".to_owned(), model_mb(&gaussians));
     let poses = keyframe_poses(folder)?;

@@ -57,6 +57,19 @@ pub fn adapters() -> Vec<AdapterReport> {
     enumerate().iter().map(AdapterReport::new).collect()
 }
 
+/// Whether it is worth loading a driver to look: on Linux a GPU has a device node.
+pub fn may_exist() -> bool {
+    if !cfg!(target_os = "linux") {
+        return true;
+    }
+    let is_node = |name: &std::ffi::OsStr| name.to_str().is_some_and(|name| name.starts_with("renderD"));
+    let rendering = std::fs::read_dir("/dev/dri");
+    rendering.is_ok_and(|nodes| nodes.flatten().any(|node| is_node(&node.file_name())))
+        || ["/dev/nvidiactl", "/dev/nvgpu", "/dev/mali0", "/dev/kgsl-3d0", "/dev/dxg"]
+            .iter()
+            .any(|node| std::path::Path::new(node).exists())
+}
+
 fn enumerate() -> Vec<Adapter> {
     let instance = Instance::new(wgpu::InstanceDescriptor::new_without_display_handle());
     pollster::block_on(instance.enumerate_adapters(wgpu::Backends::PRIMARY))

@@ -133,7 +133,7 @@ impl Context {
             staging
         });
         self.queue.submit([encoder.finish()]);
-        let waiting = staging.each_ref().map(|staging| Mapping::begin(staging));
+        let waiting = staging.each_ref().map(Mapping::begin);
         self.wait()?;
         let mut out = [const { Vec::new() }; N];
         for ((out, mapping), (buffer, (_, bytes))) in out.iter_mut().zip(waiting).zip(staging.iter().zip(from)) {
@@ -168,7 +168,7 @@ pub(super) struct Mapping {
 
 impl Mapping {
     pub fn begin(buffer: &Buffer) -> Self {
-        let (sender, done) = mpsc::channel();
+        let (sender, done) = mpsc::sync_channel(1);
         buffer.map_async(MapMode::Read, .., move |result| {
             // Nobody listens any more where the engine was dropped meanwhile.
             sender.send(result).ok();

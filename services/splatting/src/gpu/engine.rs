@@ -14,7 +14,7 @@ use super::error::GpuError;
 use super::job::{CONTROL_HALT, CONTROL_PAIRS, JOB_BYTES, Job, VIEWS_MAX, View};
 use super::kernels::Kernels;
 use super::model::{DeviceModel, blocks_of, lanes_of};
-use super::training::{Keyframes, Trainer};
+use super::training::{Gradients, Keyframes, Trainer};
 use crate::camera::{Camera, RenderSettings};
 use crate::engine::{DEPTH_ALPHA_TINY, Moments, MomentsView, Rendered};
 use crate::model::{Gaussians, LANES, ROWS, SH_REST_MAX, sh_rest_coefficients, sh_rest_rows};
@@ -306,7 +306,7 @@ impl Engine {
         settings: &TrainingSettings,
     ) -> Result<(LossTerms, Gradient), GpuError> {
         self.upload(gaussians, &mut Optimiser::new())?;
-        let (terms, parameters, bands) = loop {
+        let Gradients { terms, parameters, bands } = loop {
             self.ready(view)?;
             let (Some(trainer), Some(model)) = (&mut self.trainer, &self.model) else { continue };
             let keyframes = (model, &mut self.keyframes);

@@ -62,7 +62,7 @@ impl DeviceKeyframe {
         ssim::needed(&view.tiles, (tiles_x, tiles_y), &mut needed);
         let flags: Vec<u32> = needed
             .iter()
-            .map(|tile| HAS_FOREGROUND * u32::from(tile.gradient) | NEAR_FOREGROUND * u32::from(tile.similarity))
+            .map(|tile| u32::from(tile.gradient) * HAS_FOREGROUND + u32::from(tile.similarity) * NEAR_FOREGROUND)
             .collect();
 
         let mut bytes = Bytes::default();

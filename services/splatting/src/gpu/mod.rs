@@ -9,6 +9,7 @@
 mod adapter;
 mod buffers;
 mod chain;
+mod check;
 mod context;
 mod engine;
 mod error;
@@ -20,6 +21,7 @@ mod model;
 mod tests;
 mod training;
 
-pub use adapter::{AdapterReport, adapters};
+pub use adapter::{AdapterReport, adapters, may_exist};
+pub use check::{CheckReport, check};
 pub use engine::{Engine, Options};
 pub use error::GpuError;

@@ -50,6 +50,13 @@ struct Iteration {
     settings: TrainingSettings,
 }
 
+/// A loss and its gradient, as bytes in the layout of the model.
+pub(super) struct Gradients {
+    pub terms: LossTerms,
+    pub parameters: Vec<u8>,
+    pub bands: Vec<u8>,
+}
+
 /// Iterations on their way.
 struct Flight {
     iterations: Vec<Iteration>,
@@ -378,7 +385,7 @@ impl Trainer {
         (model, keyframes): (&DeviceModel, &mut Keyframes),
         view: &TrainingView,
         settings: &TrainingSettings,
-    ) -> Result<Result<(LossTerms, Vec<u8>, Vec<u8>), u32>, GpuError> {
+    ) -> Result<Result<Gradients, u32>, GpuError> {
         keyframes.hold(context, kernels, view, self.recorded)?;
         let iteration = Iteration {
             keyframe: view.id(),
@@ -412,7 +419,10 @@ impl Trainer {
         let [words, parameters, bands] =
             context.read([(&self.ring, 4 * RING_WORDS as u64), (&out, out.size()), (&bands_out, bands_out.size())])?;
         let words: Vec<u32> = pod_collect_to_vec(&words);
-        Ok(if words[8] == 0 { Err(words[9]) } else { Ok((self.terms(&words, &iteration), parameters, bands)) })
+        Ok(match words[8] {
+            0 => Err(words[9]),
+            _ => Ok(Gradients { terms: self.terms(&words, &iteration), parameters, bands }),
+        })
     }
 }
 

@@ -153,8 +153,8 @@ pub fn held_out_psnr_db(session: &mut Session) -> f64 {
         .iter()
         .map(|view| {
             let camera = renderer_camera(&view.pose, &view.keyframe.frame.intrinsics);
-            let (engine, model) = session.engine_and_model();
-            engine.render(model, &camera, &RenderSettings::default(), &mut image);
+            let (backend, model) = session.backend_and_model();
+            backend.render(model, &camera, &RenderSettings::default(), &mut image).unwrap();
             let truth: Vec<[f32; 3]> =
                 view.keyframe.rgb.chunks_exact(3).map(|c| [c[0], c[1], c[2]].map(|v| f32::from(v) / 255.0)).collect();
             metrics::psnr(&image.color, &truth, Some(&view.mask)).unwrap()

@@ -5,13 +5,13 @@ use shared_types::config::{Config, TrainerConfig};
 use shared_types::folder::MissionFolder;
 use trainer::checkpoint;
 use trainer::keyframes::KeyframeError;
-use trainer::session::Session;
+use trainer::session::{Session, SessionError};
 use trainer::untrained::untrained;
 
 /// Runs a round in slices of 20.
 fn train(session: &mut Session) -> u32 {
-    while !session.advance(20, || ()) {}
-    let finished = session.finish().unwrap();
+    while !session.advance(20, || ()).unwrap() {}
+    let finished = session.finish().unwrap().unwrap();
     finished.progress.iterations
 }
 
@@ -52,7 +52,8 @@ fn images_of_twice_the_size_are_brought_to_training_size() {
 
     let mut odd = session(TrainerConfig::default(), 1);
     let error = odd.begin(spec(0, 10, &ids), &mut Memory::new((100, 72))).unwrap_err();
-    assert!(matches!(error, KeyframeError::Size { id: 0, .. }) && error.to_string().contains("100x72"), "{error}");
+    let is_size = matches!(error, SessionError::Keyframe(KeyframeError::Size { id: 0, .. }));
+    assert!(is_size && error.to_string().contains("100x72"), "{error}");
     assert!(odd.model().is_empty() && odd.active().is_none());
 }
 
@@ -82,7 +83,7 @@ fn a_session_from_a_checkpoint_goes_on_with_the_same_bits() {
     let mut cut = Vec::new();
     for round in rounds.clone() {
         whole.begin(round, &mut source).unwrap();
-        whole.advance(37, || ());
+        whole.advance(37, || ()).unwrap();
         cut.push(checkpoint::to_bytes(&whole));
         train(&mut whole);
         cut.push(checkpoint::to_bytes(&whole));
@@ -134,13 +135,13 @@ fn the_newest_whole_checkpoint_wins() {
     let mut source = Memory::new((WIDTH, HEIGHT));
     let mut session_ = session(TrainerConfig::default(), 1);
     session_.begin(spec(0, 40, &[0, 4]), &mut source).unwrap();
-    session_.advance(20, || ());
+    session_.advance(20, || ()).unwrap();
     checkpoint::write(folder.path(), &session_).unwrap();
     train(&mut session_);
     let at_end = checkpoint::write(folder.path(), &session_).unwrap();
     session_.begin(spec(1, 100, &[0, 4, 2]), &mut source).unwrap();
     for _ in 0..3 {
-        session_.advance(20, || ());
+        session_.advance(20, || ()).unwrap();
         checkpoint::write(folder.path(), &session_).unwrap();
     }
     let left = || std::fs::read_dir(folder.path()).unwrap().map(|entry| entry.unwrap().path()).collect::<Vec<_>>();

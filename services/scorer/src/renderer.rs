@@ -1,0 +1,77 @@
+//! What renders candidates, and goes on when a GPU fails: once more on the same, then on the CPU.
+//!
+//! A score depends on the snapshot and the request alone, so nothing is lost with a GPU but time.
+
+use std::sync::atomic::{AtomicBool, AtomicU64};
+
+use shared_types::config::ScorerConfig;
+use shared_types::config::trainer::BackendWord;
+use splatting::{Backend, BackendError, BackendKind, Gaussians};
+
+use crate::job::{Job, Scores};
+
+/// A back end, and how to make another.
+#[derive(Debug)]
+pub struct Renderer {
+    backend: Backend,
+    kind: BackendKind,
+    adapter: Option<String>,
+    threads: usize,
+    failures: u32,
+}
+
+impl Renderer {
+    /// The configured back end.
+    ///
+    /// # Errors
+    /// When it is not there, or the system refuses threads.
+    pub fn new(config: &ScorerConfig, threads: usize) -> Result<Self, BackendError> {
+        let kind = match config.backend {
+            BackendWord::Auto => BackendKind::Auto,
+            BackendWord::Cpu => BackendKind::Cpu,
+            BackendWord::Gpu => BackendKind::Gpu,
+        };
+        let adapter = Some(config.adapter.clone()).filter(|name| !name.is_empty());
+        let (backend, why_not_gpu) = Backend::new(kind, adapter.as_deref(), threads)?;
+        match why_not_gpu {
+            Some(reason) => tracing::info!(%backend, %reason, "scoring"),
+            None => tracing::info!(%backend, "scoring"),
+        }
+        Ok(Self { backend, kind, adapter, threads, failures: 0 })
+    }
+
+    /// What renders now.
+    pub fn backend(&mut self) -> &mut Backend {
+        &mut self.backend
+    }
+
+    /// Scores a job. `None` when cancelled, or when not even the CPU is left.
+    pub fn score(&mut self, job: &Job, model: &Gaussians, cancel: &AtomicBool, done: &AtomicU64) -> Option<Scores> {
+        loop {
+            match job.run(&mut self.backend, model, cancel, done) {
+                Ok(scores) => return scores,
+                Err(error) => {
+                    self.failures += 1;
+                    tracing::error!(%error, failures = self.failures, backend = %self.backend, "scoring failed; again");
+                }
+            }
+            if let Err(error) = self.replace() {
+                tracing::error!(%error, "no back end is left");
+                return None;
+            }
+        }
+    }
+
+    /// The same back end once more, then the CPU.
+    fn replace(&mut self) -> Result<(), BackendError> {
+        let again = || Backend::new(self.kind, self.adapter.as_deref(), self.threads);
+        let fresh = if self.failures < 2 { again().ok() } else { None };
+        let (backend, _) = match fresh {
+            Some(fresh) => fresh,
+            None => Backend::new(BackendKind::Cpu, None, self.threads)?,
+        };
+        tracing::warn!(%backend, "scoring goes on");
+        self.backend = backend;
+        Ok(())
+    }
+}
