@@ -1,10 +1,11 @@
-//! The CPU engine against the machine's limits, on a synthetic scene.
+//! The engines against the machine's limits, on a synthetic scene.
 //!
 //! `cargo bench -p splatting --bench engine -- [thousands of Gaussians ...] [--only train|score95|score1000]
-//! [--threads 2] [--repetitions 40]`; 50, 100 and 200 thousand without numbers. Prints the tables and writes
+//! [--threads 2] [--repetitions 40] [--backend cpu|gpu] [--adapter NAME]`; 50, 100 and 200 thousand without numbers. Prints the tables and writes
 //! `target/bench/splatting.json`. Figures are the least of many repetitions: other processes only ever add. On a busy
 //! machine wall time says little; what counts is processor time, all threads together.
 
+mod gpu;
 mod machine;
 mod report;
 mod scene;
@@ -67,17 +68,22 @@ struct Options {
     only: Option<String>,
     threads: usize,
     repetitions: usize,
+    on_gpu: bool,
+    adapter: Option<String>,
 }
 
 impl Options {
     fn parse() -> Self {
-        let mut options = Self { counts: Vec::new(), only: None, threads: 2, repetitions: 40 };
+        let mut options =
+            Self { counts: Vec::new(), only: None, threads: 2, repetitions: 40, on_gpu: false, adapter: None };
         let mut arguments = std::env::args().skip(1);
         while let Some(argument) = arguments.next() {
             match argument.as_str() {
                 "--only" => options.only = arguments.next(),
                 "--threads" => options.threads = arguments.next().and_then(|v| v.parse().ok()).unwrap_or(2),
                 "--repetitions" => options.repetitions = arguments.next().and_then(|v| v.parse().ok()).unwrap_or(40),
+                "--backend" => options.on_gpu = arguments.next().as_deref() == Some("gpu"),
+                "--adapter" => options.adapter = arguments.next(),
                 other => options.counts.extend(other.parse::<usize>()),
             }
         }
@@ -122,6 +128,10 @@ fn scene_work(count: usize) -> Result<Work, Box<dyn std::error::Error>> {
     Ok(engine.work())
 }
 
+fn name(engine: &Engine) -> (String, usize) {
+    (format!("cpu-{:?}", engine.isa()).to_lowercase(), engine.threads())
+}
+
 /// A training iteration: stages on one thread, the whole on all threads.
 fn train(options: &Options, count: usize) -> Result<Row, Box<dyn std::error::Error>> {
     let still = still();
@@ -142,13 +152,12 @@ fn train(options: &Options, count: usize) -> Result<Row, Box<dyn std::error::Err
     let times = least(options.repetitions, || {
         black_box(engine.train_step(&mut model, &mut optimiser, &view, &still));
     });
-    let row = Row::new(&engine, "train", work, 1, times).with_memory(peak::megabytes());
+    let row = Row::of_cpu(name(&engine), "train", work, 1, times).with_memory(peak::megabytes());
     Ok(row.with_stages(STAGES.iter().copied().zip(stages)))
 }
 
-/// Moments of many views in one request.
-fn score(options: &Options, work: &'static str, count: usize) -> Result<Row, Box<dyn std::error::Error>> {
-    let model: Gaussians = scene::model(count);
+/// The views of a request.
+fn score_views(work: &str) -> Vec<MomentsView> {
     let mut views = Vec::new();
     if work == "score95" {
         views.extend((0..95).map(|i| (scene::camera(i, 95, 2.0, Vec3::ZERO), 2.0)));
@@ -160,8 +169,13 @@ fn score(options: &Options, work: &'static str, count: usize) -> Result<Row, Box
             views.push((scene::camera(i / 20, 50, radius, target), radius));
         }
     }
-    let views: Vec<MomentsView> =
-        views.into_iter().map(|(camera, reference_m)| MomentsView { camera, reference_m }).collect();
+    views.into_iter().map(|(camera, reference_m)| MomentsView { camera, reference_m }).collect()
+}
+
+/// Moments of many views in one request.
+fn score(options: &Options, work: &'static str, count: usize) -> Result<Row, Box<dyn std::error::Error>> {
+    let model: Gaussians = scene::model(count);
+    let views = score_views(work);
     let mut engine = Engine::new(options.threads)?;
     let cancel = AtomicBool::new(false);
     let repetitions = if work == "score95" { 3 } else { 1 };
@@ -174,12 +188,15 @@ fn score(options: &Options, work: &'static str, count: usize) -> Result<Row, Box
     });
     match failure {
         Some(error) => Err(error.into()),
-        None => Ok(Row::new(&engine, work, scene_work(count)?, views.len(), times)),
+        None => Ok(Row::of_cpu(name(&engine), work, scene_work(count)?, views.len(), times)),
     }
 }
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
     let options = Options::parse();
+    if options.on_gpu {
+        return gpu::run(&options);
+    }
     let machine = Machine::measure(options.threads);
     report::print_machine(&machine);
     let mut rows = Vec::new();

@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use serde::Serialize;
-use splatting::{Engine, Work};
+use splatting::Work;
 
 use crate::Least;
 use crate::machine::{Machine, REFERENCE};
@@ -19,7 +19,7 @@ pub struct Row {
     cpu_ms: f64,
     /// Iterations or views per second, by processor time on as many cores as there are threads.
     per_s: f64,
-    /// Largest resident memory of the process while training, megabytes.
+    /// Largest resident memory of the process while training (on a GPU: bytes allocated there), megabytes.
     #[serde(skip_serializing_if = "Option::is_none")]
     memory_mb: Option<f64>,
     stages: serde_json::Map<String, serde_json::Value>,
@@ -29,15 +29,32 @@ pub struct Row {
 }
 
 impl Row {
-    pub fn new(engine: &Engine, work: &'static str, counted: Work, items: usize, times: Least) -> Self {
+    /// What the CPU did, with so many threads.
+    pub fn of_cpu(
+        (backend, threads): (String, usize),
+        work: &'static str,
+        counted: Work,
+        items: usize,
+        times: Least,
+    ) -> Self {
+        let per_s = 1e3 * (items * threads) as f64 / times.cpu_ms;
+        Self::new((backend, threads, per_s), work, counted, times)
+    }
+
+    /// What a GPU did: its rates are of wall time.
+    pub fn of_gpu(backend: String, work: &'static str, counted: Work, items: usize, times: Least) -> Self {
+        Self::new((backend, 0, 1e3 * items as f64 / times.wall_ms), work, counted, times)
+    }
+
+    fn new((backend, threads, per_s): (String, usize, f64), work: &'static str, counted: Work, times: Least) -> Self {
         Self {
-            backend: format!("cpu-{:?}", engine.isa()).to_lowercase(),
+            backend,
             work,
             gaussians: counted.gaussians,
-            threads: engine.threads(),
+            threads,
             wall_ms: times.wall_ms,
             cpu_ms: times.cpu_ms,
-            per_s: 1e3 * (items * engine.threads()) as f64 / times.cpu_ms,
+            per_s,
             memory_mb: None,
             stages: serde_json::Map::new(),
             counted,
@@ -57,6 +74,10 @@ impl Row {
     /// Rate to reach and aim at, on the reference machine: per second for training, seconds for scoring.
     fn goal(&self) -> Option<(f64, f64)> {
         Some(match (self.work, self.gaussians / 1000) {
+            // On an H200.
+            ("train", 200) if self.is_gpu() => (1500.0, 2500.0),
+            ("score95", 200) if self.is_gpu() => (0.015, 0.008),
+            _ if self.is_gpu() => return None,
             ("train", 50) => (130.0, 190.0),
             ("train", 100) => (85.0, 125.0),
             ("train", 200) => (45.0, 65.0),
@@ -68,6 +89,10 @@ impl Row {
         })
     }
 
+    fn is_gpu(&self) -> bool {
+        self.threads == 0
+    }
+
     /// Least time of an item on so many cores of a machine, milliseconds: each stage at the peak of multiply-adds or at
     /// the memory's bandwidth, whichever takes longer.
     fn floor_ms(&self, machine: &Machine) -> f64 {
@@ -77,7 +102,7 @@ impl Row {
         };
         let seconds = |stage: &&str| {
             let (flops, bytes) = floor(stage, self.counted);
-            let compute = flops / (machine.fma_gflops_per_core * self.threads as f64 * 1e9);
+            let compute = flops / (machine.fma_gflops_per_core * self.threads.max(1) as f64 * 1e9);
             compute.max(bytes / (machine.bandwidth_gb_s * 1e9))
         };
         1e3 * stages.iter().map(seconds).sum::<f64>()
@@ -85,8 +110,17 @@ impl Row {
 
     /// How many times the reference machine's floor this machine's is.
     fn scale(&self, machine: &Machine) -> f64 {
-        self.floor_ms(machine) / self.floor_ms(&REFERENCE.with_cores(self.threads))
+        if self.is_gpu() { 1.0 } else { self.floor_ms(machine) / self.floor_ms(&REFERENCE.with_cores(self.threads)) }
     }
+}
+
+pub fn print_gpu(machine: &Machine) {
+    println!(
+        "{}\npeak {:.1} TFLOP/s, {:.0} GB/s",
+        machine.cpu,
+        machine.fma_gflops_per_core / 1e3,
+        machine.bandwidth_gb_s
+    );
 }
 
 pub fn print_machine(machine: &Machine) {
@@ -105,6 +139,7 @@ pub fn print_row(machine: &Machine, row: &Row) {
         let scale = row.scale(machine);
         let (found, factor, unit) = match row.work {
             "train" => (row.per_s, 1.0 / scale, "/s"),
+            _ if row.is_gpu() => (row.wall_ms / 1e3, scale, " s"),
             _ => (row.cpu_ms / 1e3 / row.threads as f64, scale, " s"),
         };
         let reached = |goal: f64| if row.work == "train" { found / goal } else { goal / found };
@@ -119,15 +154,15 @@ pub fn print_row(machine: &Machine, row: &Row) {
         );
     }
     if let Some(megabytes) = row.memory_mb {
-        println!("  {megabytes:.0} MB resident at most, everything included");
+        let kind = if row.is_gpu() { "allocated on the GPU" } else { "resident at most, everything included" };
+        println!("  {megabytes:.0} MB {kind}");
     }
     let work = row.counted;
     if !row.stages.is_empty() {
-        println!(
-            "  floor {:.2} ms here, {:.2} ms on the reference machine",
-            row.floor_ms(machine),
-            row.floor_ms(&REFERENCE.with_cores(row.threads))
-        );
+        println!("  floor {:.3} ms here", row.floor_ms(machine));
+        if !row.is_gpu() {
+            println!("  floor {:.3} ms on the reference machine", row.floor_ms(&REFERENCE.with_cores(row.threads)));
+        }
         println!(
             "  {} visible, {} (tile, splat) pairs, {} (4x4 block, splat) pairs",
             work.visible, work.entries, work.contributions
@@ -139,7 +174,7 @@ pub fn print_row(machine: &Machine, row: &Row) {
         let (compute, memory) =
             (flops / ms / 1e6 / machine.fma_gflops_per_core, bytes / ms / 1e6 / machine.bandwidth_gb_s);
         println!(
-            "    {name:<10} {ms:7.2} ms   {:7.1} MFLOP {:4.0} % of peak   {:6.1} MB {:4.0} % of bandwidth",
+            "    {name:<10} {ms:8.3} ms   {:7.1} MFLOP {:4.0} % of peak   {:6.1} MB {:4.0} % of bandwidth",
             flops / 1e6,
             100.0 * compute,
             bytes / 1e6,

@@ -20,6 +20,14 @@ const BIN_GROUPS_MAX: u32 = 64;
 /// Bits that a pass of the sort takes, and all bits of a depth.
 const PASSES: [u32; 4] = [0, 8, 16, 24];
 
+/// A stage on the way from Gaussians to lists.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Listing {
+    Project,
+    Sort,
+    Bin,
+}
+
 /// What a chain has room for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Size {
@@ -150,34 +158,35 @@ impl Chain {
         Ok(Self { size, rows, entries, starts, control, bytes, project, sort: passes, bin })
     }
 
-    /// Records projection, sort and binning. `offsets` are those of the job and of the views.
-    pub fn record(
-        &self,
-        pass: &mut ComputePass<'_>,
-        kernels: &Kernels,
-        offsets: &[u32; 2],
-        mark: &mut dyn FnMut(&mut ComputePass<'_>, &'static str),
-    ) {
+    /// Records one of the stages that lead to the lists. `offsets` are those of the job and of the views.
+    pub fn record(&self, stage: Listing, pass: &mut ComputePass<'_>, kernels: &Kernels, offsets: &[u32; 2]) {
         let (job, views) = (self.size.job(), self.size.views);
-        mark(pass, "project");
-        let (x, y) = fold(self.size.parameter_groups());
-        dispatch(pass, &kernels.project, &self.project, offsets, (x, y, views));
-        mark(pass, "sort");
-        for (count, moved, constant) in &self.sort {
-            pass.set_pipeline(&kernels.sort_count.pipeline);
-            pass.set_bind_group(0, count, kernels.sort_count.offsets(offsets));
-            pass.set_bind_group(1, constant, &[]);
-            pass.dispatch_workgroups(job.sort_groups, 1, views);
-            pass.set_pipeline(&kernels.sort_move.pipeline);
-            pass.set_bind_group(0, moved, kernels.sort_move.offsets(offsets));
-            pass.set_bind_group(1, constant, &[]);
-            pass.dispatch_workgroups(job.sort_groups, 1, views);
+        match stage {
+            Listing::Project => {
+                let (x, y) = fold(self.size.parameter_groups());
+                dispatch(pass, &kernels.project, &self.project, offsets, (x, y, views));
+            }
+            Listing::Sort => {
+                for (count, moved, constant) in &self.sort {
+                    pass.set_bind_group(1, constant, &[]);
+                    dispatch(pass, &kernels.sort_count, count, offsets, (job.sort_groups, 1, views));
+                    dispatch(pass, &kernels.sort_move, moved, offsets, (job.sort_groups, 1, views));
+                }
+            }
+            Listing::Bin => {
+                let parts = (job.bin_groups, self.size.tiles().div_ceil(256), views);
+                dispatch(pass, &kernels.bin_count, &self.bin[0], offsets, parts);
+                dispatch(pass, &kernels.bin_offsets, &self.bin[1], offsets, (1, 1, views));
+                dispatch(pass, &kernels.bin_fill, &self.bin[2], offsets, parts);
+            }
         }
-        mark(pass, "bin");
-        let parts = (job.bin_groups, self.size.tiles().div_ceil(256), views);
-        dispatch(pass, &kernels.bin_count, &self.bin[0], offsets, parts);
-        dispatch(pass, &kernels.bin_offsets, &self.bin[1], offsets, (1, 1, views));
-        dispatch(pass, &kernels.bin_fill, &self.bin[2], offsets, parts);
+    }
+
+    /// Records all stages that lead to the lists.
+    pub fn record_all(&self, pass: &mut ComputePass<'_>, kernels: &Kernels, offsets: &[u32; 2]) {
+        for stage in [Listing::Project, Listing::Sort, Listing::Bin] {
+            self.record(stage, pass, kernels, offsets);
+        }
     }
 }
 

@@ -14,7 +14,8 @@ use super::error::GpuError;
 use super::job::{CONTROL_HALT, CONTROL_PAIRS, JOB_BYTES, Job, VIEWS_MAX, View};
 use super::kernels::Kernels;
 use super::model::{DeviceModel, blocks_of, lanes_of};
-use super::training::{Gradients, Keyframes, Trainer};
+use super::peak;
+use super::training::{Gradients, Keyframes, STAGES, Trainer};
 use crate::camera::{Camera, RenderSettings};
 use crate::engine::{DEPTH_ALPHA_TINY, Moments, MomentsView, Rendered};
 use crate::model::{Gaussians, LANES, ROWS, SH_REST_MAX, sh_rest_coefficients, sh_rest_rows};
@@ -336,6 +337,44 @@ impl Engine {
         Ok((terms, out))
     }
 
+    /// What the adapter can do at best: multiply-adds, GFLOP/s, and memory, GB/s read and written. Takes seconds.
+    ///
+    /// # Errors
+    /// Where the GPU fails.
+    pub fn measure_peaks(&self) -> Result<(f64, f64), GpuError> {
+        peak::measure(&self.context)
+    }
+
+    /// Runs one step and tells how long each of its stages took on the GPU, seconds: project, sort, bin, blend, loss,
+    /// backward, Adam. `None` where the adapter has no timestamps. The model must be uploaded, and its lists fit.
+    ///
+    /// # Errors
+    /// Where the GPU fails.
+    pub fn profile(
+        &mut self,
+        view: &TrainingView,
+        settings: &TrainingSettings,
+    ) -> Result<Option<[f64; STAGES]>, GpuError> {
+        if !self.context.features.contains(Features::TIMESTAMP_QUERY) {
+            return Ok(None);
+        }
+        self.ready(view)?;
+        self.finish()?;
+        match (&mut self.trainer, &self.model) {
+            (Some(trainer), Some(model)) => {
+                let keyframes = (model, &mut self.keyframes);
+                trainer.profile(&self.context, &self.kernels, keyframes, view, settings).map(Some)
+            }
+            _ => Ok(None),
+        }
+    }
+
+    /// Loses the device, as a reset does.
+    #[cfg(test)]
+    pub(super) fn lose_device(&self) {
+        self.context.device.destroy();
+    }
+
     /// Makes sure that there is a trainer for views of this size.
     fn ready(&mut self, view: &TrainingView) -> Result<(), GpuError> {
         let Some(model) = &self.model else { return Ok(()) };
@@ -402,7 +441,7 @@ impl Drawing {
     fn run(&self, engine: &Engine, last: impl FnOnce(&mut wgpu::ComputePass<'_>, &Kernels)) -> Result<(), GpuError> {
         let mut encoder = engine.context.encoder();
         let mut pass = encoder.begin_compute_pass(&ComputePassDescriptor::default());
-        self.chain.record(&mut pass, &engine.kernels, &[0, 0], &mut |_, _| {});
+        self.chain.record_all(&mut pass, &engine.kernels, &[0, 0]);
         last(&mut pass, &engine.kernels);
         drop(pass);
         engine.context.queue.submit([encoder.finish()]);

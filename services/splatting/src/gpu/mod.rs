@@ -17,6 +17,7 @@ mod job;
 mod kernels;
 mod keyframe;
 mod model;
+mod peak;
 #[cfg(test)]
 mod tests;
 mod training;

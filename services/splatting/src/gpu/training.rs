@@ -3,10 +3,10 @@
 use std::collections::{BTreeMap, VecDeque};
 
 use bytemuck::{bytes_of, pod_collect_to_vec};
-use wgpu::{BindGroup, Buffer, BufferUsages, ComputePassDescriptor};
+use wgpu::{BindGroup, Buffer, BufferUsages, ComputePass, ComputePassDescriptor};
 
 use super::buffers::Bytes;
-use super::chain::{Chain, Size, dispatch};
+use super::chain::{Chain, Listing, Size, dispatch};
 use super::context::{Context, Mapping, copy};
 use super::error::GpuError;
 use super::job::{Job, STRIDE, View, fold};
@@ -48,6 +48,43 @@ struct Iteration {
     counts: Counts,
     view: View,
     settings: TrainingSettings,
+}
+
+impl Iteration {
+    fn new(view: &TrainingView, settings: &TrainingSettings) -> Self {
+        Self {
+            keyframe: view.id(),
+            counts: Counts::new(view),
+            view: View::new(view.camera(), &settings.render, 0.0),
+            settings: *settings,
+        }
+    }
+}
+
+/// A stage of an iteration, as the CPU engine names them.
+#[derive(Clone, Copy)]
+enum Stage {
+    Listing(Listing),
+    Blend,
+    Loss,
+    Backward,
+    /// With the sum of the terms.
+    Adam,
+}
+
+/// Number of stages: those of [`crate::Engine::stage_times`].
+pub(super) const STAGES: usize = 7;
+
+impl Stage {
+    const ALL: [Self; STAGES] = [
+        Self::Listing(Listing::Project),
+        Self::Listing(Listing::Sort),
+        Self::Listing(Listing::Bin),
+        Self::Blend,
+        Self::Loss,
+        Self::Backward,
+        Self::Adam,
+    ];
 }
 
 /// A loss and its gradient, as bytes in the layout of the model.
@@ -223,12 +260,7 @@ impl Trainer {
     ) -> Result<(), GpuError> {
         self.recorded += 1;
         keyframes.hold(context, kernels, view, self.recorded)?;
-        self.waiting.push(Iteration {
-            keyframe: view.id(),
-            counts: Counts::new(view),
-            view: View::new(view.camera(), &settings.render, 0.0),
-            settings: *settings,
-        });
+        self.waiting.push(Iteration::new(view, settings));
         if self.waiting.len() >= ITERATIONS {
             self.submit(context, kernels, model, keyframes)?;
         }
@@ -255,7 +287,9 @@ impl Trainer {
             let mut pass = encoder.begin_compute_pass(&ComputePassDescriptor::default());
             for (slot, iteration) in iterations.iter().enumerate() {
                 let offset = (STRIDE * slot as u64) as u32;
-                self.record(&mut pass, kernels, keyframes, &[offset, offset], iteration, (&kernels.adam, &self.adam));
+                if let Some(keyframe) = keyframes.held.get(&iteration.keyframe) {
+                    self.record(&mut pass, kernels, keyframe, &[offset, offset], (&kernels.adam, &self.adam));
+                }
             }
             drop(pass);
             let bytes = self.ring.size();
@@ -271,26 +305,88 @@ impl Trainer {
     /// Records the dispatches of one iteration, of which `last` takes the gradients.
     fn record(
         &self,
-        pass: &mut wgpu::ComputePass<'_>,
+        pass: &mut ComputePass<'_>,
         kernels: &Kernels,
-        keyframes: &Keyframes,
+        keyframe: &DeviceKeyframe,
         offsets: &[u32; 2],
-        iteration: &Iteration,
+        last: (&Kernel, &BindGroup),
+    ) {
+        for stage in Stage::ALL {
+            self.record_stage(stage, pass, kernels, keyframe, offsets, last);
+        }
+    }
+
+    fn record_stage(
+        &self,
+        stage: Stage,
+        pass: &mut ComputePass<'_>,
+        kernels: &Kernels,
+        keyframe: &DeviceKeyframe,
+        offsets: &[u32; 2],
         (last, group): (&Kernel, &BindGroup),
     ) {
         let size = self.chain.size;
-        let Some(keyframe) = keyframes.held.get(&iteration.keyframe) else { return };
-        self.chain.record(pass, kernels, offsets, &mut |_, _| {});
-        let grid = (size.tiles_x(), size.tiles_y(), 1);
-        dispatch(pass, &kernels.blend, &self.blend, offsets, grid);
-        pass.set_bind_group(1, &keyframe.ssim, &[]);
-        dispatch(pass, &kernels.ssim, &self.ssim, offsets, grid);
-        pass.set_bind_group(1, &keyframe.loss, &[]);
-        dispatch(pass, &kernels.loss, &self.loss, offsets, grid);
-        dispatch(pass, &kernels.backward, &self.backward, offsets, (2 * size.tiles_x(), 2 * size.tiles_y(), 1));
-        let (x, y) = fold(size.parameter_groups());
-        dispatch(pass, last, group, offsets, (x, y, 1));
-        dispatch(pass, &kernels.metrics, &self.metrics, offsets, (1, 1, 1));
+        let tiles = (size.tiles_x(), size.tiles_y(), 1);
+        match stage {
+            Stage::Listing(listing) => self.chain.record(listing, pass, kernels, offsets),
+            Stage::Blend => dispatch(pass, &kernels.blend, &self.blend, offsets, tiles),
+            Stage::Loss => {
+                pass.set_bind_group(1, &keyframe.ssim, &[]);
+                dispatch(pass, &kernels.ssim, &self.ssim, offsets, tiles);
+                pass.set_bind_group(1, &keyframe.loss, &[]);
+                dispatch(pass, &kernels.loss, &self.loss, offsets, tiles);
+            }
+            Stage::Backward => {
+                let quarters = (2 * size.tiles_x(), 2 * size.tiles_y(), 1);
+                dispatch(pass, &kernels.backward, &self.backward, offsets, quarters);
+            }
+            Stage::Adam => {
+                let (x, y) = fold(size.parameter_groups());
+                dispatch(pass, last, group, offsets, (x, y, 1));
+                dispatch(pass, &kernels.metrics, &self.metrics, offsets, (1, 1, 1));
+            }
+        }
+    }
+
+    /// Runs one iteration with every stage in a pass of its own, and tells how long each took on the GPU, seconds. Nothing
+    /// may be under way, and room for the pairs must be known. Needs timestamps.
+    pub fn profile(
+        &mut self,
+        context: &Context,
+        kernels: &Kernels,
+        (model, keyframes): (&DeviceModel, &mut Keyframes),
+        view: &TrainingView,
+        settings: &TrainingSettings,
+    ) -> Result<[f64; STAGES], GpuError> {
+        const STAMPS: u32 = 2 * STAGES as u32;
+        keyframes.hold(context, kernels, view, self.recorded)?;
+        let Some(keyframe) = keyframes.held.get(&view.id()) else { return Ok([f64::NAN; STAGES]) };
+        let iteration = Iteration::new(view, settings);
+        context.queue.write_buffer(&self.jobs, 0, bytes_of(&job(self.chain.size, model, 0, &iteration)));
+        context.queue.write_buffer(&self.views, 0, bytes_of(&iteration.view));
+        let stamps = context.device.create_query_set(&wgpu::QuerySetDescriptor {
+            label: None,
+            ty: wgpu::QueryType::Timestamp,
+            count: STAMPS,
+        });
+        let bytes = 8 * u64::from(STAMPS);
+        let resolved = context.buffer("timestamps", bytes, BufferUsages::QUERY_RESOLVE | BufferUsages::COPY_SRC);
+        let mut encoder = context.encoder();
+        for (at, stage) in (0..).zip(Stage::ALL) {
+            let timestamp_writes = Some(wgpu::ComputePassTimestampWrites {
+                query_set: &stamps,
+                beginning_of_pass_write_index: Some(2 * at),
+                end_of_pass_write_index: Some(2 * at + 1),
+            });
+            let mut pass = encoder.begin_compute_pass(&ComputePassDescriptor { label: None, timestamp_writes });
+            self.record_stage(stage, &mut pass, kernels, keyframe, &[0, 0], (&kernels.adam, &self.adam));
+        }
+        encoder.resolve_query_set(&stamps, 0..STAMPS, &resolved, 0);
+        context.queue.submit([encoder.finish()]);
+        let [ticks] = context.read([(&resolved, bytes)])?;
+        let ticks: Vec<u64> = pod_collect_to_vec(&ticks);
+        let period_s = 1e-9 * f64::from(context.queue.get_timestamp_period());
+        Ok(std::array::from_fn(|at| ticks[2 * at + 1].saturating_sub(ticks[2 * at]) as f64 * period_s))
     }
 
     /// Takes in what has come back; with `all`, waits for all of it, else only for what is too far behind. Returns how
@@ -387,12 +483,7 @@ impl Trainer {
         settings: &TrainingSettings,
     ) -> Result<Result<Gradients, u32>, GpuError> {
         keyframes.hold(context, kernels, view, self.recorded)?;
-        let iteration = Iteration {
-            keyframe: view.id(),
-            counts: Counts::new(view),
-            view: View::new(view.camera(), &settings.render, 0.0),
-            settings: *settings,
-        };
+        let iteration = Iteration::new(view, settings);
         let out = context.storage("gradients", model.parameters.size())?;
         let bands_out = context.storage("gradients", model.bands.size())?;
         let group = kernels.gradient.bind(
@@ -413,7 +504,9 @@ impl Trainer {
         context.queue.write_buffer(&self.views, 0, bytes_of(&iteration.view));
         let mut encoder = context.encoder();
         let mut pass = encoder.begin_compute_pass(&ComputePassDescriptor::default());
-        self.record(&mut pass, kernels, keyframes, &[0, 0], &iteration, (&kernels.gradient, &group));
+        if let Some(keyframe) = keyframes.held.get(&iteration.keyframe) {
+            self.record(&mut pass, kernels, keyframe, &[0, 0], (&kernels.gradient, &group));
+        }
         drop(pass);
         context.queue.submit([encoder.finish()]);
         let [words, parameters, bands] =

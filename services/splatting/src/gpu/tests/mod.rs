@@ -3,6 +3,7 @@
 //! Without an adapter each says that it was skipped; with `VANTAGE_EXPECT_GPU=1` it fails instead.
 //! `VANTAGE_TEST_ADAPTER` names another adapter than the first.
 
+mod check;
 mod edges;
 mod forward;
 mod gradients;
