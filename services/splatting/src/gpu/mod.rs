@@ -1,6 +1,6 @@
 //! The GPU back end: the same model, images, losses and steps as the CPU engine, on any adapter that wgpu reaches.
 //!
-//! Kernels are the files of `shaders/`, one each, with the source of what they compute. An iteration is 19 dispatches:
+//! Kernels are the files of `shaders/`, one each, with the source of what they compute. An iteration is 18 dispatches:
 //! projection, four passes of an exact radix sort by depth (two each), three of binning, blending, similarity, loss,
 //! backward blending, Adam with the projection's backward pass, and the sum of the terms. What one leaves the next one
 //! reads; nothing is read back before the host asks for it, and what the host learns late (the terms of the loss, lists

@@ -3,6 +3,7 @@
 use crate::common::*;
 use shared_types::config::{Config, TrainerConfig};
 use shared_types::folder::MissionFolder;
+use splatting::{Backend, BackendKind};
 use trainer::checkpoint;
 use trainer::keyframes::KeyframeError;
 use trainer::session::{Session, SessionError};
@@ -127,6 +128,39 @@ fn the_untrained_model_is_all_keyframes_of_the_last_round_inserted_at_once() {
     let positions = |model: &splatting::Gaussians| model.iter().map(|g| g.mean.to_array()).collect::<Vec<_>>();
     assert_eq!(positions(&found), positions(inserted.model()));
     assert!(positions(&found) != positions(trained.model()), "training moves them");
+}
+
+/// A round that was begun on one back end goes on on the other, and back.
+#[test]
+fn a_round_changes_its_back_end_by_a_checkpoint() {
+    let Some(adapter) = splatting::gpu::adapters().into_iter().next() else {
+        assert!(std::env::var_os("VANTAGE_EXPECT_GPU").is_none(), "no GPU adapter, but one was expected");
+        println!("a_round_changes_its_back_end_by_a_checkpoint: skipped, no GPU adapter");
+        return;
+    };
+    let gpu = || Backend::new(BackendKind::Gpu, Some(&adapter.name), 1).unwrap().0;
+    let cpu = || Backend::new(BackendKind::Cpu, None, 1).unwrap().0;
+    let mut source = Memory::new((48, 36));
+    let model = shared_types::config::ModelConfig { width: 48, height: 36, ..model_config() };
+    let mut bytes = None;
+    for (backend, iterations) in [(cpu(), 30), (gpu(), 60), (cpu(), 90)] {
+        let mut session = Session::new(TrainerConfig::default(), model.clone(), backend);
+        match bytes.take() {
+            None => session.begin(spec(0, 90, &[0, 2, 4]), &mut source).unwrap(),
+            Some(bytes) => {
+                let checkpoint: Vec<u8> = bytes;
+                checkpoint::from_bytes(&checkpoint).unwrap().restore_into(&mut session);
+                session.resume(&mut source).unwrap();
+            }
+        }
+        let before = session.model().iter().next().unwrap();
+        assert_eq!(session.advance(30, || ()).unwrap(), iterations == 90);
+        session.sync().unwrap();
+        assert_eq!(session.progress().iterations, iterations);
+        assert!(session.progress().psnr_train_db > 10.0 && session.model().is_finite());
+        assert!(session.model().iter().next().unwrap() != before, "it trains: {:?}", session.backend());
+        bytes = Some(checkpoint::to_bytes(&session));
+    }
 }
 
 #[test]
