@@ -91,6 +91,7 @@ impl Size {
 pub(super) struct Chain {
     pub size: Size,
     pub rows: Buffer,
+    pub boxes: Buffer,
     pub entries: Buffer,
     pub starts: Buffer,
     pub control: Buffer,
@@ -155,7 +156,7 @@ impl Chain {
             kernels.bin_fill.bind(context, 0, &[jobs, &control, &order[0], &boxes, &table, &entries]),
         ];
         context.check()?;
-        Ok(Self { size, rows, entries, starts, control, bytes, project, sort: passes, bin })
+        Ok(Self { size, rows, boxes, entries, starts, control, bytes, project, sort: passes, bin })
     }
 
     /// Records one of the stages that lead to the lists. `offsets` are those of the job and of the views.

@@ -36,6 +36,9 @@ pub struct Options {
     pub without_subgroups: bool,
     /// Do without atomic addition of floats.
     pub without_float_atomics: bool,
+    /// Give sums of gradients an order, so that runs on the same adapter and driver repeat bit for bit, for 192 bytes
+    /// per (tile, splat) pair.
+    pub deterministic: bool,
     /// Room for (tile, splat) pairs at first, for tests of what happens when it is not enough; 0: a good guess.
     pub pairs: u32,
 }
@@ -62,7 +65,7 @@ impl Engine {
         excluded.set(Features::SUBGROUP, options.without_subgroups);
         excluded.set(Features::SHADER_FLOAT32_ATOMIC, options.without_float_atomics);
         let context = Context::new(&adapter, excluded)?;
-        let kernels = Kernels::new(&context)?;
+        let kernels = Kernels::new(&context, options.deterministic)?;
         Ok(Self { context, kernels, model: None, trainer: None, keyframes: Keyframes::default(), pairs: options.pairs })
     }
 

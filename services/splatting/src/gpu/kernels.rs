@@ -120,14 +120,26 @@ pub(super) const SOURCES: &[Source] = &[
     },
     Source {
         name: "backward_native",
-        parts: &[JOB, BACKWARD, shader!("add_native")],
+        parts: &[JOB, BACKWARD, shader!("settle_native")],
         group0: BACKWARD_BINDINGS,
         group1: &[],
     },
     Source {
         name: "backward_compare",
-        parts: &[JOB, BACKWARD, shader!("add_compare")],
+        parts: &[JOB, BACKWARD, shader!("settle_compare")],
         group0: BACKWARD_BINDINGS,
+        group1: &[],
+    },
+    Source {
+        name: "backward_ordered",
+        parts: &[JOB, BACKWARD, shader!("settle_ordered")],
+        group0: BACKWARD_BINDINGS,
+        group1: &[],
+    },
+    Source {
+        name: "gather",
+        parts: &[JOB, shader!("gather")],
+        group0: &[Job, Read, Read, Read, Read, Read, Read, Write],
         group1: &[],
     },
     Source {
@@ -264,13 +276,15 @@ pub(super) struct Kernels {
     pub ssim: Kernel,
     pub loss: Kernel,
     pub backward: Kernel,
+    /// Where the backward pass is deterministic.
+    pub gather: Option<Kernel>,
     pub adam: Kernel,
     pub gradient: Kernel,
     pub metrics: Kernel,
 }
 
 impl Kernels {
-    pub fn new(context: &Context) -> Result<Self, GpuError> {
+    pub fn new(context: &Context, deterministic: bool) -> Result<Self, GpuError> {
         let kernel = |name| Kernel::new(context, name);
         let has = |feature| context.features.contains(feature);
         Ok(Self {
@@ -284,11 +298,12 @@ impl Kernels {
             moments: kernel("moments")?,
             ssim: kernel("ssim")?,
             loss: kernel("loss")?,
-            backward: kernel(if has(Features::SHADER_FLOAT32_ATOMIC) {
-                "backward_native"
-            } else {
-                "backward_compare"
+            backward: kernel(match has(Features::SHADER_FLOAT32_ATOMIC) {
+                _ if deterministic => "backward_ordered",
+                true => "backward_native",
+                false => "backward_compare",
             })?,
+            gather: if deterministic { Some(kernel("gather")?) } else { None },
             adam: kernel("adam")?,
             gradient: kernel("gradient")?,
             metrics: kernel("metrics")?,

@@ -113,6 +113,7 @@ pub(super) struct Trainer {
     ssim: BindGroup,
     loss: BindGroup,
     backward: BindGroup,
+    gather: Option<BindGroup>,
     adam: BindGroup,
     metrics: BindGroup,
     pub bytes: Bytes,
@@ -178,6 +179,11 @@ impl Trainer {
         let maps = storage("images", 36 * size.pixels())?;
         let reached = storage("tile lists", 4 * (tiles + u64::from(size.capacity)))?;
         context.check()?;
+        // A place for each quarter of a tile and splat, where sums must have an order.
+        let partials = match &kernels.gather {
+            Some(_) => Some(storage("ordered sums", 192 * u64::from(size.capacity))?),
+            None => None,
+        };
         let (jobs_ref, views_ref) = (&jobs, &views);
         let blend = kernels.blend.bind(
             context,
@@ -189,8 +195,23 @@ impl Trainer {
         let backward = kernels.backward.bind(
             context,
             1,
-            &[jobs_ref, views_ref, &chain.rows, &chain.starts, &chain.entries, &reached, &image, &gradients],
+            &[
+                jobs_ref,
+                views_ref,
+                &chain.rows,
+                &chain.starts,
+                &chain.entries,
+                &reached,
+                &image,
+                partials.as_ref().unwrap_or(&gradients),
+            ],
         );
+        let gather = kernels.gather.as_ref().zip(partials.as_ref()).map(|(kernel, partials)| {
+            let lists = [&chain.starts, &chain.entries, &reached];
+            let [starts, entries, reached] = lists;
+            let buffers = [jobs_ref, &chain.rows, &chain.boxes, starts, entries, reached, partials, &gradients];
+            kernel.bind(context, 0, &buffers)
+        });
         let adam = kernels.adam.bind(
             context,
             1,
@@ -218,6 +239,7 @@ impl Trainer {
             ssim,
             loss,
             backward,
+            gather,
             adam,
             metrics,
             bytes,
@@ -339,6 +361,10 @@ impl Trainer {
             Stage::Backward => {
                 let quarters = (2 * size.tiles_x(), 2 * size.tiles_y(), 1);
                 dispatch(pass, &kernels.backward, &self.backward, offsets, quarters);
+                if let (Some(kernel), Some(group)) = (&kernels.gather, &self.gather) {
+                    let (x, y) = fold(size.parameter_groups());
+                    dispatch(pass, kernel, group, offsets, (x, y, 1));
+                }
             }
             Stage::Adam => {
                 let (x, y) = fold(size.parameter_groups());

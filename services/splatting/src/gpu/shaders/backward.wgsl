@@ -9,6 +9,9 @@
 // Sixteen splats at a time, in two halves. First the threads of a block are its pixels and go past the splats, which is a
 // chain, leaving h and the weight of each. Then they are the splats and sum over the pixels: no shuffles, no atomics
 // but one addition of each moment per (block, splat).
+//
+// What becomes of a block's sums is up to one of three files: `settle_native.wgsl` and `settle_compare.wgsl` add them to the
+// splat's at once, in no order; `settle_ordered.wgsl` keeps them apart, for `gather.wgsl` to add in an order.
 
 @group(0) @binding(0) var<uniform> job: Job;
 @group(0) @binding(1) var<storage, read> views: array<View>;
@@ -77,6 +80,7 @@ fn main(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lo
     upstream[local] = gradient;
     var transmittance = 1.0;
 
+    let quarter = group.y % 2u * 2u + group.x % 2u;
     // Bits of this quarter's blocks among the sixteen of the tile.
     let first_block = group.y % 2u * 8u + group.x % 2u * 2u;
     for (var first = begin; first < end; first += BATCH) {
@@ -88,6 +92,7 @@ fn main(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lo
             let blocks = reached[tiles + first + i] >> first_block;
             let mine = (blocks & 3u) | (blocks >> 2u & 12u);
             if mine != 0u {
+                prepare(4u * (first + i) + quarter);
                 let splat = entries[first + i];
                 splats[i] = splat;
                 batch[3u * i] = rows[ROW * splat];
@@ -140,12 +145,13 @@ fn main(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lo
             }
             workgroupBarrier();
             // Threads are splats.
+            var sums = array<f32, 10>();
+            var touched = false;
             if mine < BATCH {
                 let mean = batch[3u * mine].xy;
                 var sum_h = vec3f();
                 var sum_hh = vec3f();
                 var sum_channels = vec4f();
-                var touched = false;
                 for (var i = 0u; i < 16u; i++) {
                     // Each thread begins elsewhere, so that they read from different banks.
                     let p = (i + lane) % 16u;
@@ -157,21 +163,11 @@ fn main(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lo
                     sum_channels += share.y * upstream[block * 16u + p];
                     touched |= share.y > 0.0;
                 }
-                if touched {
-                    let place = MOMENTS * splats[mine];
-                    add_to(place, sum_h.x);
-                    add_to(place + 1u, sum_h.y);
-                    add_to(place + 2u, sum_h.z);
-                    add_to(place + 3u, sum_hh.x);
-                    add_to(place + 4u, sum_hh.y);
-                    add_to(place + 5u, sum_hh.z);
-                    add_to(place + 6u, sum_channels.x);
-                    add_to(place + 7u, sum_channels.y);
-                    add_to(place + 8u, sum_channels.z);
-                    add_to(place + 9u, sum_channels.w);
-                    add_to(place + 10u, 1.0);
-                }
+                sums = array<f32, 10>(
+                    sum_h.x, sum_h.y, sum_h.z, sum_hh.x, sum_hh.y, sum_hh.z,
+                    sum_channels.x, sum_channels.y, sum_channels.z, sum_channels.w);
             }
+            settle(touched, block, splats[mine % BATCH], 4u * (first + mine % BATCH) + quarter, sums);
             workgroupBarrier();
         }
         workgroupBarrier();

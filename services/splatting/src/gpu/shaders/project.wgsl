@@ -25,6 +25,8 @@ fn main(
     let place = group.z * job.gaussians + index;
     let g = gaussian_at(index);
     let p = project_gaussian(view, g);
+    // A box without tiles, until there is one.
+    boxes[place] = 0x0000ffffu;
     if !p.visible {
         keys[place] = NOT_DRAWN;
         return;

@@ -152,6 +152,32 @@ fn lists_that_do_not_fit_cost_time_and_nothing_else() {
 }
 
 #[test]
+fn ordered_sums_repeat_bit_for_bit_and_are_the_same_gradients() {
+    let test = "ordered_sums_repeat_bit_for_bit_and_are_the_same_gradients";
+    let Some(options) = options() else { return skipped(test) };
+    let (start, views) = task(400, (64, 48), 1);
+    let options = Options { deterministic: true, ..options };
+    let run = |pairs: u32| {
+        let mut engine = Engine::new(&Options { pairs, ..options.clone() }).unwrap();
+        on_gpu(&mut engine, &start, &views, 20)
+    };
+    let (model, optimiser, terms) = run(0);
+    // Lists that do not fit at first change nothing, to the bit.
+    for (again, other_optimiser, other_terms) in [run(0), run(100)] {
+        assert!(again == model && other_optimiser == optimiser && other_terms == terms);
+    }
+    let (_, ordered) = Engine::new(&options).unwrap().gradient(&start, &views[0], &settings()).unwrap();
+    let (_, expected) = crate::Engine::new(1).unwrap().gradient(&start, &views[0], &settings());
+    let (mut dot, mut a2, mut b2) = (0.0, 0.0, 0.0);
+    for (a, b) in ordered.parameters.iter().flatten().zip(expected.parameters.iter().flatten()) {
+        let (a, b) = (f64::from(*a), f64::from(*b));
+        (dot, a2, b2) = (dot + a * b, a2 + a * a, b2 + b * b);
+    }
+    // The scene's own image has depths that differ from those rendered by little.
+    assert!(dot / (a2 * b2).sqrt() > 0.999, "{}", dot / (a2 * b2).sqrt());
+}
+
+#[test]
 fn a_lost_device_is_an_error_and_a_new_engine_goes_on() {
     let test = "a_lost_device_is_an_error_and_a_new_engine_goes_on";
     let Some(options) = options() else { return skipped(test) };

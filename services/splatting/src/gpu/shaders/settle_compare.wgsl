@@ -1,4 +1,4 @@
-// Addition to a float of a buffer that other workgroups add to as well, by comparing and swapping its bits.
+// Sums of a block are added to its splat's by comparing and swapping their bits.
 
 @group(0) @binding(7) var<storage, read_write> gradients: array<atomic<u32>>;
 
@@ -11,5 +11,16 @@ fn add_to(place: u32, value: f32) {
             break;
         }
         old = result.old_value;
+    }
+}
+
+fn prepare(place: u32) {}
+
+fn settle(touched: bool, block: u32, splat: u32, place: u32, sums: array<f32, 10>) {
+    if touched {
+        for (var k = 0u; k < 10u; k++) {
+            add_to(MOMENTS * splat + k, sums[k]);
+        }
+        add_to(MOMENTS * splat + 10u, 1.0);
     }
 }
