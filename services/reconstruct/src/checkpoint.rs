@@ -180,6 +180,13 @@ pub fn newest(folder: &Path, run: u64) -> Option<State> {
     })
 }
 
+/// The name of the newest checkpoint in a folder, whole or not.
+#[must_use]
+pub fn any(folder: &Path) -> Option<String> {
+    let (_, path) = list(folder).into_iter().next()?;
+    Some(path.file_name()?.to_string_lossy().into_owned())
+}
+
 /// Removes all checkpoints of a folder.
 pub fn remove_all(folder: &Path) {
     for (_, path) in list(folder) {

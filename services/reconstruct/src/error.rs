@@ -168,6 +168,39 @@ pub enum ReconstructError {
         /// In the command that was given.
         wanted: String,
     },
+    /// The output folder holds files that a run would replace, and no run.
+    #[error(
+        "{out} holds {found}, but not as the folder of a reconstruction (with its run.json and lock): nothing there is \
+         replaced, with --overwrite neither; give another folder with --out, or move these files away"
+    )]
+    NotOurs {
+        /// The folder.
+        out: PathBuf,
+        /// What would be replaced.
+        found: String,
+    },
+    /// The output folder is a mission, or one that a mission keeps its own files in.
+    #[error(
+        "--out is {out}, where the mission {mission} keeps its own files; expected a folder of its own, such as \
+         {mission}/reconstruct, which is the default"
+    )]
+    InMission {
+        /// The folder.
+        out: PathBuf,
+        /// The mission.
+        mission: PathBuf,
+    },
+    /// The output folder's `run.json` cannot be read: nobody knows whose checkpoints lie there.
+    #[error(
+        "{path} is damaged ({found}); expected the options of the run whose checkpoints lie beside it: give \
+         --overwrite to begin anew, or another folder with --out"
+    )]
+    DamagedRun {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong with it.
+        found: String,
+    },
     /// Another process trains into the output folder.
     #[error("another reconstruction runs in {out}: wait for it, end it, or give another folder with --out")]
     Busy {
@@ -249,7 +282,13 @@ impl ReconstructError {
                 DatasetError::Damaged { .. } | DatasetError::TooFew { .. } => ErrorKind::Failed,
                 DatasetError::Folder(error) => folder_kind(error),
             },
-            Self::Option { .. } | Self::Finished { .. } | Self::OtherRun { .. } | Self::Busy { .. } => ErrorKind::Usage,
+            Self::Option { .. }
+            | Self::Finished { .. }
+            | Self::OtherRun { .. }
+            | Self::NotOurs { .. }
+            | Self::InMission { .. }
+            | Self::DamagedRun { .. }
+            | Self::Busy { .. } => ErrorKind::Usage,
             Self::Write(error) => folder_kind(error),
             Self::Output { .. } | Self::Engine(_) => ErrorKind::Missing,
             Self::View { .. } | Self::Empty { .. } => ErrorKind::Failed,

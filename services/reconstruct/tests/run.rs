@@ -203,6 +203,22 @@ fn a_folder_with_another_run_is_not_gone_on_with() {
 }
 
 #[test]
+fn checkpoints_of_a_damaged_run_are_not_thrown_away_unasked() {
+    let dir = tempfile::tempdir().expect("folder");
+    scene(dir.path());
+    let options = Options { iterations: 40, ..options(dir.path(), "out") };
+    cut_off(&options, |event| matches!(event, Event::Began { .. }));
+    let checkpoint = options.out.join("checkpoint-000000000.ckpt");
+    for damaged in ["", "{"] {
+        fs::write(options.out.join("run.json"), damaged).expect("damaged");
+        let message = refused(&options).to_string();
+        assert!(message.contains("run.json is damaged") && message.contains("--overwrite"), "{message}");
+        assert!(checkpoint.exists());
+    }
+    finish(&Options { overwrite: true, ..options });
+}
+
+#[test]
 fn without_points_training_begins_at_random_and_without_held_out_images_nothing_is_measured() {
     let dir = tempfile::tempdir().expect("folder");
     scene(dir.path());
