@@ -54,6 +54,20 @@ fn a_mission_is_reconstructed_through_kills_with_the_same_bits() {
     assert!(psnr(rows.len() - 1) > psnr(0) + 1.0, "{report:#}");
     assert_eq!(checkpoints(&whole), 0);
 
+    assert_eq!(report["offline"]["psnr_object_db"], after["offline"]["psnr_object_db"]);
+
+    // Killed between the last of training's files and the measuring: only that is made up for.
+    let trained = fs::metadata(whole.join("model.ply")).and_then(|file| file.modified()).expect("model.ply");
+    for path in [whole.join("metrics.json"), mission.join("report/metrics.json")] {
+        let mut json: serde_json::Value = serde_json::from_slice(&fs::read(&path).expect("read")).expect("JSON");
+        json.as_object_mut().expect("an object").remove("offline");
+        fs::write(&path, json.to_string()).expect("written");
+    }
+    let (status, text) = run(reconstruct(&mission, &whole, &arguments));
+    assert_eq!(status, Some(0), "{text}");
+    assert_eq!(metrics(&mission)["offline"]["psnr_object_db"], after["offline"]["psnr_object_db"]);
+    assert_eq!(fs::metadata(whole.join("model.ply")).and_then(|file| file.modified()).expect("model.ply"), trained);
+
     // Killed with SIGKILL, twice, each time after it wrote a checkpoint (at most every 50 ms, for this test).
     for kills in 1..=2 {
         let mut command =

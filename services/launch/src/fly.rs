@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::Context as _;
 use rustix::fs::{FlockOperation, flock};
-use shared_types::config::{Config, Layer, LinkConfig, load};
+use shared_types::config::{Config, Layer, LinkConfig, load, load_mission};
 use shared_types::folder::{MissionFolder, write_atomic};
 use shared_types::system::{Hold, System};
 use world::SceneConfig;
@@ -44,7 +44,7 @@ pub fn fly(arguments: &Fly) -> anyhow::Result<Exit> {
 /// As [`fly`]; also when the folder holds no mission, or another process flies it.
 pub fn resume(arguments: &Resume) -> anyhow::Result<Exit> {
     let folder = MissionFolder::open(&arguments.folder)?;
-    let mut config = load(&[Layer::of_file(&folder.config_path())?])?;
+    let mut config = load_mission(&folder.config_path())?;
     config.mission.folder = utf8(folder.root())?;
     if let Some(speed) = arguments.speed {
         config.clock.speed = speed;

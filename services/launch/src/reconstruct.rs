@@ -11,8 +11,8 @@ use anyhow::Context as _;
 use indicatif::{ProgressBar, ProgressStyle};
 use reconstruct::report::Report;
 use reconstruct::{ErrorKind, Event, Options, Outcome, ReconstructError};
-use shared_types::config::{Layer, load};
-use shared_types::folder::MissionFolder;
+use shared_types::config::load_mission;
+use shared_types::folder::{MissionFolder, write_atomic};
 
 use crate::cli;
 use crate::evaluate::metrics::Offline;
@@ -30,6 +30,17 @@ const LINE_PERIOD: Duration = Duration::from_secs(5);
 /// What is wrong with the arguments, the dataset or the output folder, with its exit code.
 pub fn run(arguments: &cli::Reconstruct) -> anyhow::Result<Exit> {
     let options = options_of(arguments);
+    options.check().map_err(refusal)?;
+    // Hours of training are not to end with an object that cannot be read.
+    let mission = Simulated::of(&options.folder)?;
+    if let Some(mission) = &mission
+        && !options.overwrite
+        && !is_measured(&options.out)
+        && let Some(report) = reconstruct::finished(&options).map_err(refusal)?
+    {
+        say("trained already, but not measured on the true object: measuring");
+        return conclude(arguments, &report, Some(mission), &options.out);
+    }
     let interrupted = Arc::new(AtomicBool::new(false));
     for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM] {
         signal_hook::flag::register(signal, Arc::clone(&interrupted)).context("cannot listen to signals")?;
@@ -46,18 +57,41 @@ pub fn run(arguments: &cli::Reconstruct) -> anyhow::Result<Exit> {
             say(&format!("stopped at iteration {iteration} of {iterations}; the same command goes on ({out})"));
             Ok(Exit::Failed)
         }
-        Outcome::Finished { report, out } => {
-            let offline = measure_mission(&options, &report, &out)?;
-            if arguments.json {
-                let mut json = serde_json::to_value(&*report).context("metrics")?;
-                if let Some(offline) = &offline {
-                    json["offline"] = serde_json::to_value(offline).context("metrics")?;
-                }
-                return print(&(serde_json::to_string_pretty(&json).context("metrics")? + "\n"));
-            }
-            print(&table(&report, offline.as_ref(), &out))
-        }
+        Outcome::Finished { report, out } => conclude(arguments, &report, mission.as_ref(), &out),
     }
+}
+
+/// A report with what was measured on the true object.
+#[derive(serde::Serialize)]
+struct Measured<'a> {
+    #[serde(flatten)]
+    report: &'a Report,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    offline: Option<&'a Offline>,
+}
+
+/// Measures the model where there is a truth, and tells how the run went.
+fn conclude(
+    arguments: &cli::Reconstruct,
+    report: &Report,
+    mission: Option<&Simulated>,
+    out: &Path,
+) -> anyhow::Result<Exit> {
+    let offline = mission.map(|mission| mission.measure(report, out)).transpose()?;
+    let measured = Measured { report, offline: offline.as_ref() };
+    let json = serde_json::to_string_pretty(&measured).context("metrics")? + "\n";
+    if offline.is_some() {
+        // Last: it is what says that nothing is left to do.
+        write_atomic(&out.join("metrics.json"), json.as_bytes())?;
+    }
+    print(&if arguments.json { json } else { table(report, offline.as_ref(), out) })
+}
+
+/// Whether the model of a finished run was measured on the true object too.
+fn is_measured(out: &Path) -> bool {
+    let json = std::fs::read(out.join("metrics.json")).ok();
+    let json = json.and_then(|bytes| serde_json::from_slice::<serde_json::Value>(&bytes).ok());
+    json.is_some_and(|json| json.get("offline").is_some())
 }
 
 fn options_of(arguments: &cli::Reconstruct) -> Options {
@@ -108,34 +142,43 @@ fn refusal(error: ReconstructError) -> anyhow::Error {
     Refusal { exit, message: error.to_string() }.into()
 }
 
-/// Measures the model of a simulated mission on the views that its live model is measured on, and notes it beside that one.
-/// `None` for other datasets, and for missions without a truth to compare with.
-fn measure_mission(options: &Options, report: &Report, out: &Path) -> anyhow::Result<Option<Offline>> {
-    let Ok(folder) = MissionFolder::open(&options.folder) else { return Ok(None) };
-    if !folder.config_path().is_file() {
-        return Ok(None);
+/// A simulated mission, with the true object that its models are measured on.
+struct Simulated {
+    folder: MissionFolder,
+    effort: Effort,
+    truth: Truth,
+}
+
+impl Simulated {
+    /// The mission in a folder; `None` for other datasets, and for missions without a truth to compare with.
+    fn of(folder: &Path) -> anyhow::Result<Option<Self>> {
+        let Ok(folder) = MissionFolder::open(folder) else { return Ok(None) };
+        let config = load_mission(&folder.config_path())?;
+        if !config.link.is_local() {
+            return Ok(None);
+        }
+        Ok(Some(Self { folder, effort: Effort::of(&config), truth: Truth::build(&config)? }))
     }
-    let config = load(&[Layer::of_file(&folder.config_path())?])?;
-    if !config.link.is_local() {
-        return Ok(None);
+
+    /// Measures a model on the views that the live model is measured on, and notes it beside that one.
+    fn measure(&self, report: &Report, out: &Path) -> anyhow::Result<Offline> {
+        let (truth, effort) = (&self.truth, self.effort);
+        let model = evaluate::read_model(&out.join("model.ply"))?;
+        let quality = views::appearance(truth, &model, &views::held_out(truth, effort)?, effort)?;
+        let mut offline = Offline {
+            iterations: Some(report.run.iterations),
+            keyframes: Some(report.run.training),
+            gaussians: Some(report.gaussians),
+            seconds: report.last().map(|row| row.wall_s),
+            ..Offline::default()
+        };
+        offline.take(&quality);
+        if let Some(mut metrics) = evaluate::read_metrics(&self.folder)? {
+            metrics.offline = offline.clone();
+            evaluate::write_metrics(&self.folder, &metrics)?;
+        }
+        Ok(offline)
     }
-    let model = evaluate::read_model(&out.join("model.ply"))?;
-    let truth = Truth::build(&config)?;
-    let effort = Effort::of(&config);
-    let quality = views::appearance(&truth, &model, &views::held_out(&truth, effort)?, effort)?;
-    let mut offline = Offline {
-        iterations: Some(report.run.iterations),
-        keyframes: Some(report.run.training),
-        gaussians: Some(report.gaussians),
-        seconds: report.last().map(|row| row.wall_s),
-        ..Offline::default()
-    };
-    offline.take(&quality);
-    if let Some(mut metrics) = evaluate::read_metrics(&folder)? {
-        metrics.offline = offline.clone();
-        evaluate::write_metrics(&folder, &metrics)?;
-    }
-    Ok(Some(offline))
 }
 
 /// What a run ends with.

@@ -3,7 +3,7 @@
 //! - [`dataset`]: posed images, whatever format they come in; [`split`](mod@split): which are trained on;
 //! - [`start`], [`recipe`]: what the model begins with, and what is minimised how fast;
 //! - [`run`](mod@run): the loop; [`views`], [`evaluate`](mod@evaluate), [`progress`]: what it looks at and tells;
-//! - [`checkpoint`], [`output`], [`report`], [`picture`]: what it leaves.
+//! - [`checkpoint`], [`output`], [`report`], [`picture`]: what it leaves; [`finished`](mod@finished): what was left.
 //!
 //! A library without a process of its own. The same seed gives the same bits for any number of threads, and a run that was
 //! killed goes on with the bits of one that never was.
@@ -13,6 +13,7 @@ pub mod checkpoint;
 pub mod dataset;
 pub mod error;
 pub mod evaluate;
+pub mod finished;
 pub mod options;
 pub mod output;
 pub mod picture;
@@ -26,6 +27,7 @@ pub mod views;
 
 pub use dataset::MaskUse;
 pub use error::{ErrorKind, ReconstructError};
+pub use finished::finished;
 pub use options::{Background, Options, StrategyName};
 pub use progress::{Event, Observer, Progress};
 pub use run::{Outcome, run};

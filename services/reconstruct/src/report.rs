@@ -2,14 +2,14 @@
 
 use std::fmt::Write as _;
 
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 use splatting::bytes::{Reader, Truncated, Writer};
 
 use crate::evaluate::Quality;
 use crate::options::Identity;
 
 /// One evaluation: a row of `metrics.csv`. Processor and wall time are of training alone, without evaluations.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Row {
     /// Iterations run.
     pub iteration: u32,
@@ -102,7 +102,7 @@ pub fn csv(rows: &[Row]) -> String {
 }
 
 /// `metrics.json`: the whole run.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Report {
     /// What was run.
     pub run: Identity,
@@ -129,7 +129,7 @@ pub struct Report {
 }
 
 /// Memory by kind, megabytes.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 pub struct Memory {
     /// Images as loaded.
     pub images_mb: f64,

@@ -67,8 +67,8 @@ pub fn run(options: &Options, observer: &mut dyn Observer) -> Result<Outcome, Re
     let split = split(&listing, options.hold_out)?;
     let output = Output::open(&options.out)?;
     output.check_finished(options.overwrite)?;
-    let memory_bytes = options.memory_bytes.unwrap_or_else(default_memory_bytes);
-    let load = LoadOptions { downscale: options.downscale, mask: options.mask, memory_bytes };
+    let load = load_options(options);
+    let memory_bytes = load.memory_bytes;
     let dataset = dataset::load(&listing, &load)?;
     let loaded = Event::Loaded {
         format: dataset.format.name(),
@@ -91,6 +91,12 @@ pub fn run(options: &Options, observer: &mut dyn Observer) -> Result<Outcome, Re
         flow = both(flow, run.evaluate(observer)?);
     }
     run.train(observer, flow)
+}
+
+/// How a run's images are brought into memory.
+pub(crate) fn load_options(options: &Options) -> LoadOptions {
+    let memory_bytes = options.memory_bytes.unwrap_or_else(default_memory_bytes);
+    LoadOptions { downscale: options.downscale, mask: options.mask, memory_bytes }
 }
 
 fn both(a: ControlFlow<()>, b: ControlFlow<()>) -> ControlFlow<()> {

@@ -129,6 +129,13 @@ fn a_run_learns_the_scene_and_leaves_its_figures() {
         assert!(image::open(options.out.join(picture)).expect("a picture").width() > 90, "{picture}");
     }
     assert!(matches!(refused(&options), ReconstructError::Finished { .. }), "a finished run is not overwritten");
+    let found = reconstruct::finished(&options).expect("read").expect("over");
+    assert_eq!((found.run, found.gaussians), (report.run, report.gaussians));
+    let other = Options { seed: 1, ..options.clone() };
+    assert_eq!(reconstruct::finished(&other).expect("read"), None, "another run's");
+    let absent = Options { out: dir.path().join("absent"), ..options };
+    assert_eq!(reconstruct::finished(&absent).expect("read"), None);
+    assert!(!absent.out.exists());
 }
 
 #[test]

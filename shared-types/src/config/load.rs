@@ -34,6 +34,17 @@ pub enum ConfigError {
         /// The operating system's reason.
         reason: String,
     },
+    /// The configuration of a mission, which `vantage fly` wrote whole, is gone.
+    #[error(
+        "{path} is {found}; expected the configuration that the mission was flown with: put the file back, or give the \
+         folder of another mission"
+    )]
+    NoMission {
+        /// The file.
+        path: String,
+        /// What is there.
+        found: String,
+    },
     /// A `--set` that is not `section.key=value`.
     #[error("--set {argument}: expected section.key=value, for example --set planner.keyframes=24")]
     BadSet {
@@ -232,6 +243,22 @@ fn overlay(below: &mut toml::Table, above: toml::Table) {
             }
         }
     }
+}
+
+/// The configuration of a mission, from its `mission.toml`. Where that says nothing the defaults would be another mission's.
+///
+/// # Errors
+/// [`ConfigError::NoMission`] where the file is missing or empty; as [`load`].
+pub fn load_mission(path: &Path) -> Result<Config, ConfigError> {
+    let gone = |found: &str| ConfigError::NoMission { path: path.display().to_string(), found: found.to_owned() };
+    if !path.exists() {
+        return Err(gone("missing"));
+    }
+    let layer = Layer::of_file(path)?;
+    if layer.check()?.is_empty() {
+        return Err(gone("empty"));
+    }
+    load(&[layer])
 }
 
 /// Lays the layers over the defaults, the last one on top, and refuses what cannot be.

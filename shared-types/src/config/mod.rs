@@ -24,7 +24,7 @@ pub use clock::{ClockConfig, ClockMode};
 pub use document::commented;
 pub use launch::LaunchConfig;
 pub use link::LinkConfig;
-pub use load::{ConfigError, Layer, PRESETS, load, preset};
+pub use load::{ConfigError, Layer, PRESETS, load, load_mission, preset};
 pub use mission::MissionConfig;
 pub use model::ModelConfig;
 pub use planner::PlannerConfig;

@@ -13,7 +13,7 @@ pub mod views;
 use std::path::Path;
 
 use anyhow::Context as _;
-use shared_types::config::{Config, Layer, load};
+use shared_types::config::{Config, load_mission};
 use shared_types::folder::{FolderError, MissionFolder, write_atomic};
 use shared_types::frames::Pose;
 use splatting::Gaussians;
@@ -52,7 +52,7 @@ impl Effort {
 /// When the folder holds no mission or no model, or the object of the mission cannot be read.
 pub fn run(arguments: &Evaluate) -> anyhow::Result<Exit> {
     let folder = MissionFolder::open(&arguments.folder)?;
-    let config = load(&[Layer::of_file(&folder.config_path())?])?;
+    let config = load_mission(&folder.config_path())?;
     let official = Effort::of(&config);
     let mut effort = official;
     if let Some(views) = arguments.views {

@@ -16,7 +16,7 @@ const POINT_M: DVec3 = DVec3::new(0.2, -0.1, 0.4);
 /// Two views; in each the middle of the image is a plane 1.5 m away.
 fn mission() -> (tempfile::TempDir, MissionFolder, Vec<Frame>) {
     let dir = tempfile::tempdir().expect("tempdir");
-    let folder = MissionFolder::create(dir.path().join("m")).expect("folder");
+    let folder = MissionFolder::create_with(dir.path().join("m"), "mission.seed = 3\n").expect("folder");
     let mut frames = Vec::new();
     for (id, eye) in [(3, DVec3::new(1.2, 0.8, 1.5)), (7, DVec3::new(-1.0, 1.1, 0.9))] {
         let pose = look_at(eye, POINT_M + DVec3::new(0.05, 0.1, 0.0));

@@ -23,7 +23,7 @@ fn errors_carry_the_exit_code_of_their_kind() {
 
 /// A mission of three views whose depth is a plane 1.5 m away, with a prior about the point that they look at.
 fn mission(root: &Path) -> MissionFolder {
-    let folder = MissionFolder::create(root).expect("folder");
+    let folder = MissionFolder::create_with(root, "mission.seed = 3\n").expect("folder");
     let target = DVec3::new(0.2, -0.1, 0.4);
     for (id, eye) in [(3, DVec3::new(1.2, 0.8, 1.5)), (7, DVec3::new(-1.0, 1.1, 0.9)), (8, DVec3::new(0.3, -1.2, 1.1))]
     {
@@ -136,4 +136,29 @@ fn a_mission_without_a_prior_says_so() {
     assert!(message.contains("journal.jsonl") && message.contains("never found its object"), "{message}");
     std::fs::remove_file(folder.journal_path()).expect("removed");
     assert!(dataset::list(folder.root(), None).expect_err("no journal").to_string().contains("does not exist"));
+}
+
+#[test]
+fn a_mission_without_its_configuration_is_not_taken_for_one_of_the_defaults() {
+    let dir = tempfile::tempdir().expect("folder");
+    let folder = mission(dir.path());
+    std::fs::write(folder.config_path(), "\n# nothing\n").expect("emptied");
+    let options = Options::new(folder.root());
+    let refused =
+        || refusal(reconstruct::run(&options, &mut |_: &Event| ControlFlow::Continue(())).expect_err("refused"));
+    assert!(refused().to_string().contains("mission.toml is empty"), "{}", refused());
+    std::fs::remove_file(folder.config_path()).expect("removed");
+    assert!(refused().to_string().contains("mission.toml is missing"), "{}", refused());
+    assert_eq!(crate::exit::exit_of(&refused()), Exit::Usage);
+}
+
+#[test]
+fn a_run_is_measured_once_its_figures_say_so() {
+    let dir = tempfile::tempdir().expect("folder");
+    let path = dir.path().join("metrics.json");
+    assert!(!is_measured(dir.path()), "nothing is there");
+    std::fs::write(&path, "{\"gaussians\": 3}").expect("written");
+    assert!(!is_measured(dir.path()));
+    std::fs::write(&path, "{\"gaussians\": 3, \"offline\": {}}").expect("written");
+    assert!(is_measured(dir.path()));
 }

@@ -5,7 +5,7 @@ use std::path::Path;
 use glam::{DVec3, Vec3};
 use serde_json::Value;
 use shared_types::config::planner::RadiusRule;
-use shared_types::config::{Config, Layer, load};
+use shared_types::config::{Config, load_mission};
 use shared_types::folder::MissionFolder;
 use shared_types::messages::KeyframeReason;
 use splatting::rgbd::clip_box::ClipBox;
@@ -22,14 +22,7 @@ pub fn clip_box(folder: &MissionFolder) -> Result<Option<ClipBox>, DatasetError>
     if !path.is_file() || prior_of(&path)?.is_none() {
         return Ok(None);
     }
-    Ok(Some(stage_of(&path, &config_of(folder)?)?.clip))
-}
-
-fn config_of(folder: &MissionFolder) -> Result<Config, DatasetError> {
-    Ok(match folder.config_path() {
-        path if path.is_file() => load(&[Layer::of_file(&path)?])?,
-        _ => Config::default(),
-    })
+    Ok(Some(stage_of(&path, &load_mission(&folder.config_path())?)?.clip))
 }
 
 /// Lists the keyframes of a mission.
@@ -38,7 +31,7 @@ fn config_of(folder: &MissionFolder) -> Result<Config, DatasetError> {
 /// [`DatasetError`]: a file of the folder is damaged, or the mission never found its object.
 pub fn list(root: &Path) -> Result<Listing, DatasetError> {
     let folder = MissionFolder::open(root)?;
-    let config = config_of(&folder)?;
+    let config = load_mission(&folder.config_path())?;
     let mut entries = Vec::new();
     for id in folder.list_keyframes()? {
         let Some(frame) = folder.read_frame(KeyframeReason::Selected, id)? else { continue };
