@@ -49,8 +49,9 @@ pub enum DatasetError {
     },
     /// Nothing, or too little, is left to train on or to judge by.
     #[error(
-        "{root} has {images} usable images, of which {training} are left for training once every {hold_out}th is held \
-         out; expected at least 2: add images, or give another --hold-out (0: none)"
+        "{root} has {images} usable images, of which {training} are left for training{}; expected at least 2: {}",
+        HeldOut(*hold_out),
+        if *hold_out == 0 { "add images" } else { "add images, or give another --hold-out (0: none)" }
     )]
     TooFew {
         /// The dataset.
@@ -61,6 +62,20 @@ pub enum DatasetError {
         training: usize,
         /// Every how many-th is held out.
         hold_out: usize,
+    },
+    /// The masks leave nothing to learn from.
+    #[error(
+        "{path} is {what} in which no pixel counts, and so are those of all {images} training images; expected white or \
+         opaque pixels, or depth in the mission's box, where the object is: correct them, or give --mask off to train \
+         on whole images"
+    )]
+    NothingCounts {
+        /// The first of them.
+        path: PathBuf,
+        /// What the file is.
+        what: &'static str,
+        /// Images to train on.
+        images: usize,
     },
     /// The images do not fit.
     #[error(
@@ -85,6 +100,19 @@ pub enum DatasetError {
     /// The mission's configuration cannot be read.
     #[error(transparent)]
     Config(#[from] shared_types::config::ConfigError),
+}
+
+/// How images are held out, as it stands behind those that are left.
+struct HeldOut(usize);
+
+impl core::fmt::Display for HeldOut {
+    fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
+        match self.0 {
+            0 => Ok(()),
+            1 => write!(f, " once all are held out (--hold-out 1)"),
+            every => write!(f, " once one in {every} is held out"),
+        }
+    }
 }
 
 /// Line of a text file, as it stands behind the file's name.
@@ -248,6 +276,20 @@ pub enum ReconstructError {
         /// Why.
         source: splatting::ViewError,
     },
+    /// What training begins with is in no image.
+    #[error(
+        "none of the {gaussians} Gaussians made from {origin} is in any of the {images} training images: poses and points \
+         do not belong together; expected both from the same model of the scene, in the same units and axes: export them \
+         again together, or take the points away to begin with random ones"
+    )]
+    Unseen {
+        /// Gaussians.
+        gaussians: usize,
+        /// What they were made from.
+        origin: &'static str,
+        /// Images to train on.
+        images: usize,
+    },
     /// The model was lost: every Gaussian was pruned away.
     #[error("no Gaussians are left after iteration {iteration}: the poses or the masks do not fit the images")]
     Empty {
@@ -275,17 +317,21 @@ impl ReconstructError {
     pub fn kind(&self) -> ErrorKind {
         match self {
             Self::Dataset(error) => match error {
-                DatasetError::Unknown { .. } | DatasetError::Config(_) => ErrorKind::Usage,
+                DatasetError::Unknown { .. }
+                | DatasetError::Config(_)
+                | DatasetError::TooFew { .. }
+                | DatasetError::NothingCounts { .. } => ErrorKind::Usage,
                 DatasetError::Missing { .. } | DatasetError::Read { .. } | DatasetError::Memory { .. } => {
                     ErrorKind::Missing
                 }
-                DatasetError::Damaged { .. } | DatasetError::TooFew { .. } => ErrorKind::Failed,
+                DatasetError::Damaged { .. } => ErrorKind::Failed,
                 DatasetError::Folder(error) => folder_kind(error),
             },
             Self::Option { .. }
             | Self::Finished { .. }
             | Self::OtherRun { .. }
             | Self::NotOurs { .. }
+            | Self::Unseen { .. }
             | Self::InMission { .. }
             | Self::DamagedRun { .. }
             | Self::Busy { .. } => ErrorKind::Usage,

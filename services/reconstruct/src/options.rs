@@ -131,8 +131,11 @@ impl Options {
         if self.sh_degree > SH_DEGREE_MAX {
             return no("--sh-degree", self.sh_degree.to_string(), "0 to 3");
         }
-        if self.threads > 1024 {
-            return no("--threads", self.threads.to_string(), "0 (one per core) to 1024");
+        let cores = cores();
+        if self.threads > most_threads(cores) {
+            let most = most_threads(cores);
+            let expected = format!("0 (one per core) to {most}: 4 for each of the {cores} cores here, at most {MOST_THREADS}");
+            return no("--threads", self.threads.to_string(), &expected);
         }
         if self.downscale.is_some_and(|factor| !(1..=64).contains(&factor)) {
             return no("--downscale", format!("{}", self.downscale.unwrap_or(0)), "1 to 64");
@@ -147,10 +150,22 @@ impl Options {
     #[must_use]
     pub fn thread_count(&self) -> usize {
         match self.threads {
-            0 => std::thread::available_parallelism().map_or(1, usize::from),
+            0 => cores(),
             threads => threads,
         }
     }
+}
+
+/// Threads that a run takes at most, whatever the machine: each has buffers of its own.
+const MOST_THREADS: usize = 256;
+
+/// More threads than a few a core only wait for each other.
+fn most_threads(cores: usize) -> usize {
+    cores.saturating_mul(4).min(MOST_THREADS)
+}
+
+fn cores() -> usize {
+    std::thread::available_parallelism().map_or(1, usize::from)
 }
 
 /// Version of what a run computes: a run of another version is not gone on with.
@@ -243,6 +258,8 @@ mod tests {
         assert!(refused(Options { iterations: 0, ..good.clone() }).contains("--iterations is 0"));
         assert!(refused(Options { max_gaussians: 1, ..good.clone() }).contains("--max-gaussians is 1"));
         assert!(refused(Options { sh_degree: 4, ..good.clone() }).contains("--sh-degree is 4"));
+        assert!(refused(Options { threads: 257, ..good.clone() }).contains("--threads is 257"));
+        assert_eq!([1, 2, 64, 65, 1000].map(most_threads), [4, 8, 256, 256, 256]);
         assert!(refused(Options { downscale: Some(0), ..good.clone() }).contains("--downscale is 0"));
     }
 

@@ -70,6 +70,7 @@ pub fn run(options: &Options, observer: &mut dyn Observer) -> Result<Outcome, Re
     let load = load_options(options);
     let memory_bytes = load.memory_bytes;
     let dataset = dataset::load(&listing, &load)?;
+    dataset::check_counts(&listing, &dataset, &split.training)?;
     let loaded = Event::Loaded {
         format: dataset.format.name(),
         training: split.training.len(),
@@ -146,6 +147,10 @@ impl<'a> Run<'a> {
                 };
                 let bounds = (options.max_gaussians, options.sh_degree, options.seed);
                 let start = start::start(dataset, &split.training, how, bounds);
+                if !start::is_seen(&start.model, &training, recipe.render(0).near_m) {
+                    let (gaussians, origin) = (start.model.len(), start.origin.name());
+                    return Err(ReconstructError::Unseen { gaussians, origin, images: training.len() });
+                }
                 let densifier = Densifier::new(recipe.strategy, extent_m, options.seed, &start.model)?;
                 (State::begin(start.model, &densifier, options.seed, training.len()), start.origin, false)
             }

@@ -78,7 +78,10 @@ mod tests {
     fn two_images_are_needed_for_training() {
         let message = split(&listing(&[None; 2]), 8).expect_err("one is left").to_string();
         assert!(message.contains("2 usable images, of which 1 are left"), "{message}");
-        assert!(split(&listing(&[None; 2]), 1).is_err());
+        let message = split(&listing(&[None; 9]), 1).expect_err("none is left").to_string();
+        assert!(message.contains("0 are left for training once all are held out"), "{message}");
+        let message = split(&listing(&[None; 1]), 0).expect_err("one").to_string();
+        assert!(message.contains("1 are left for training; expected at least 2: add images"), "{message}");
         assert!(split(&listing(&[]), 8).is_err());
     }
 }

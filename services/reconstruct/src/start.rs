@@ -1,6 +1,6 @@
 //! The model that training begins with: from depth as in live flight, else from sparse points, else at random.
 
-use glam::{DMat3, DVec3, Vec3};
+use glam::{DMat3, DVec3, Vec2, Vec3};
 use shared_types::config::trainer::BirthShape;
 use splatting::rgbd::clip_box::ClipBox;
 use splatting::rgbd::insertion::{self, InsertionRules};
@@ -108,6 +108,23 @@ pub fn start(
     Start { model, origin }
 }
 
+/// Standard deviations within which a Gaussian is seen.
+const SEEN_SIGMAS: f32 = 3.0;
+
+/// Whether any Gaussian of a model reaches into any image, before the camera and not nearer than `near_m`.
+#[must_use]
+pub fn is_seen(model: &Gaussians, images: &[&Image], near_m: f32) -> bool {
+    let within = |camera: &Camera, gaussian: &splatting::Gaussian| {
+        let Some((pixel, depth_m)) = camera.project(gaussian.mean).filter(|(_, depth_m)| *depth_m >= near_m) else {
+            return false;
+        };
+        let reach = SEEN_SIGMAS * gaussian.log_scales.max_element().exp() * camera.fx.max(camera.fy) / depth_m;
+        let nearest = pixel.clamp(Vec2::ZERO, Vec2::new(camera.width as f32, camera.height as f32));
+        pixel.distance(nearest) <= reach
+    };
+    images.iter().any(|image| model.iter().any(|gaussian| within(&image.camera, &gaussian)))
+}
+
 /// As [`from_depth`] without a stage, with voxels so large that at most `most` Gaussians come of it: leaving some of them out
 /// would leave holes.
 fn from_depth_at_most(images: &[&Image], edge_m: f32, most: usize) -> Gaussians {
@@ -207,6 +224,36 @@ mod tests {
     use splatting::Pose;
 
     use super::*;
+
+    #[test]
+    fn a_gaussian_is_seen_where_it_reaches_into_an_image() {
+        let image = Image {
+            name: "a".to_owned(),
+            camera: Camera::from_hfov(Pose::IDENTITY, 1.0, 64, 48),
+            colors: crate::dataset::Colors::Bytes(vec![[9; 3]; 64 * 48]),
+            depth_m: None,
+            classes: None,
+            held_out: None,
+        };
+        let seen = |mean: Vec3, sigma: f32| {
+            let gaussian = splatting::Gaussian {
+                mean,
+                log_scales: Vec3::splat(sigma.ln()),
+                rotation: glam::Quat::IDENTITY,
+                opacity_logit: 0.0,
+                sh: [0.0; 3],
+                id: 0,
+                birth_round: 0,
+            };
+            is_seen(&[gaussian].into_iter().collect(), &[&image], 0.05)
+        };
+        assert!(seen(Vec3::Z, 0.01));
+        assert!(!seen(-Vec3::Z, 0.01), "behind");
+        assert!(!seen(0.01 * Vec3::Z, 0.001), "too near");
+        assert!(!seen(Vec3::new(3.0, 0.0, 1.0), 0.01), "beside");
+        assert!(seen(Vec3::new(3.0, 0.0, 1.0), 1.0), "beside, and large enough");
+        assert!(!is_seen(&Gaussians::new(), &[&image], 0.05));
+    }
 
     #[test]
     fn larger_voxels_and_not_holes_make_room() {

@@ -238,6 +238,27 @@ fn without_points_training_begins_at_random_and_without_held_out_images_nothing_
 }
 
 #[test]
+fn points_of_another_scene_and_masks_that_leave_nothing_are_named() {
+    let dir = tempfile::tempdir().expect("folder");
+    scene(dir.path());
+    let options = options(dir.path(), "out");
+    fs::create_dir_all(dir.path().join("masks")).expect("folder");
+    for id in 0..VIEWS {
+        let mask = dir.path().join(format!("masks/{id:03}.png.png"));
+        image::GrayImage::new(SIZE.0, SIZE.1).save(mask).expect("saved");
+    }
+    let error = refused(&options);
+    let message = error.to_string();
+    assert!(message.contains("001.png.png is a mask") && message.contains("--mask off"), "{message}");
+    assert_eq!(error.kind(), reconstruct::ErrorKind::Usage);
+    let points: String = (0..9).map(|id| format!("{id} {} 0 {} 9 9 9 0\n", 5000 + id, id % 3)).collect();
+    fs::write(dir.path().join("sparse/0/points3D.txt"), points).expect("written");
+    let error = refused(&Options { mask: reconstruct::MaskUse::Off, ..options });
+    assert!(error.to_string().contains("do not belong together"), "{error}");
+    assert_eq!(error.kind(), reconstruct::ErrorKind::Usage);
+}
+
+#[test]
 fn an_output_that_cannot_be_written_and_one_in_use_are_named() {
     let dir = tempfile::tempdir().expect("folder");
     scene(dir.path());

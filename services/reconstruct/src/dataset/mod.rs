@@ -17,7 +17,7 @@ use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 use shared_types::config::TrainerConfig;
 use shared_types::frames::{Intrinsics, Pose};
-use splatting::Camera;
+use splatting::{Camera, PixelClass};
 use splatting::bytes::checksum;
 use splatting::rgbd::clip_box::ClipBox;
 
@@ -229,6 +229,25 @@ pub fn load(listing: &Listing, options: &LoadOptions) -> Result<Dataset, Dataset
         stage: listing.stage.clone(),
         downscale,
     })
+}
+
+/// Refuses images to train on of which no pixel counts: the model would learn nothing, and no figure would say so.
+///
+/// # Errors
+/// [`DatasetError::NothingCounts`].
+pub fn check_counts(listing: &Listing, dataset: &Dataset, training: &[usize]) -> Result<(), DatasetError> {
+    let counts = |image: &Image| image.classes.as_ref().is_none_or(|classes| classes.contains(&PixelClass::Foreground));
+    let mut images = training.iter().filter_map(|&index| dataset.images.get(index));
+    let Some(entry) = training.first().and_then(|&index| listing.entries.get(index)) else { return Ok(()) };
+    if images.any(counts) {
+        return Ok(());
+    }
+    let (path, what) = match (&entry.mask, &entry.depth) {
+        (Some(mask), _) => (mask, "a mask"),
+        (None, Some(depth)) if dataset.stage.is_some() => (&depth.path, "a depth image"),
+        (None, _) => (&entry.path, "an image"),
+    };
+    Err(DatasetError::NothingCounts { path: path.clone(), what, images: training.len() })
 }
 
 /// Bytes that the images of a listing take at most, shrunk by `downscale`.
