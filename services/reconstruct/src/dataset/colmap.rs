@@ -147,10 +147,9 @@ fn entry_of(
     let [w, x, y, z] = image.rotation;
     let camera_from_world =
         Pose { position_m: DVec3::from_array(image.translation), rotation: DQuat::from_xyzw(x, y, z, w) };
-    if !camera_from_world.position_m.is_finite() {
-        let found = format!("{:?}", image.translation);
-        return Err(DatasetError::damaged(images_file, field("TX TY TZ"), found, "finite numbers"));
-    }
+    super::check_position(camera_from_world.position_m).map_err(|expected| {
+        DatasetError::damaged(images_file, field("TX TY TZ"), format!("{:?}", image.translation), expected)
+    })?;
     if !camera_from_world.is_sane() {
         let found = format!("{:?}", image.rotation);
         return Err(DatasetError::damaged(images_file, field("QW QX QY QZ"), found, "a quaternion of length 1"));

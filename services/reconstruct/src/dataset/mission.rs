@@ -6,7 +6,7 @@ use glam::{DVec3, Vec3};
 use serde_json::Value;
 use shared_types::config::planner::RadiusRule;
 use shared_types::config::{Config, load_mission};
-use shared_types::folder::MissionFolder;
+use shared_types::folder::{Frame, MissionFolder};
 use shared_types::messages::KeyframeReason;
 use splatting::rgbd::clip_box::ClipBox;
 
@@ -36,6 +36,7 @@ pub fn list(root: &Path) -> Result<Listing, DatasetError> {
     for id in folder.list_keyframes()? {
         let Some(frame) = folder.read_frame(KeyframeReason::Selected, id)? else { continue };
         let path = folder.keyframe_path(id);
+        check_frame(&path.join("frame.json"), &frame)?;
         entries.push(Entry {
             name: format!("{id:06}.png"),
             path: path.join("rgb.png"),
@@ -63,6 +64,20 @@ pub fn list(root: &Path) -> Result<Listing, DatasetError> {
         stage: Some(stage),
         downscale,
     })
+}
+
+/// What the folder's own reader leaves open.
+fn check_frame(path: &Path, frame: &Frame) -> Result<(), DatasetError> {
+    super::check_intrinsics(&frame.intrinsics).map_err(|(what, found, expected)| {
+        DatasetError::damaged(path, format!("intrinsics: {what}"), found, expected)
+    })?;
+    let position = frame.world_from_camera_position_m;
+    super::check_position(DVec3::from_array(position)).map_err(|expected| {
+        DatasetError::damaged(path, "world_from_camera_position_m", format!("{position:?}"), expected)
+    })?;
+    let unit = frame.depth_unit_m;
+    super::check_depth_unit(unit)
+        .map_err(|expected| DatasetError::damaged(path, "depth_unit_m", unit.to_string(), expected))
 }
 
 /// Line and entry of the prior in a journal. A mission may look for its object again; the last word counts.

@@ -17,9 +17,9 @@ use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 use shared_types::config::TrainerConfig;
 use shared_types::frames::{Intrinsics, Pose};
-use splatting::{Camera, PixelClass};
 use splatting::bytes::checksum;
 use splatting::rgbd::clip_box::ClipBox;
+use splatting::{Camera, PixelClass};
 
 use crate::error::DatasetError;
 pub use image::{Colors, Image, MaskUse};
@@ -311,17 +311,43 @@ pub(crate) fn up_of(entries: &[Entry]) -> Vec3 {
     (-down).try_normalize().unwrap_or(DVec3::Z).as_vec3()
 }
 
-/// Checks a pinhole camera; the error says which part of it is wrong.
-pub(crate) fn check_intrinsics(camera: &Intrinsics) -> Result<(), (&'static str, String, &'static str)> {
+/// Farthest that a camera may be from the origin along an axis: the renderer's f32 is then worth 6 cm.
+pub(crate) const MAX_POSITION: f64 = 1e6;
+/// Metres a unit of depth that make sense: from micrometres to metres.
+const DEPTH_UNITS_M: std::ops::RangeInclusive<f64> = 1e-6..=1.0;
+
+/// Checks a position; the error says what is expected.
+pub(crate) fn check_position(position: DVec3) -> Result<(), String> {
+    let is_near = position.is_finite() && position.abs().max_element() <= MAX_POSITION;
+    if is_near { Ok(()) } else { Err(format!("finite numbers from -{MAX_POSITION} to {MAX_POSITION}")) }
+}
+
+/// Checks metres a unit of depth; the error says what is expected.
+pub(crate) fn check_depth_unit(unit_m: f64) -> Result<(), String> {
+    let (least, most) = (DEPTH_UNITS_M.start(), DEPTH_UNITS_M.end());
+    let expected = || format!("metres a unit of depth, {least:e} to {most}");
+    if DEPTH_UNITS_M.contains(&unit_m) { Ok(()) } else { Err(expected()) }
+}
+
+/// Checks a pinhole camera; the error says which part of it is wrong. What is far out of an image's scale would overflow the
+/// renderer's f32, and is a mistake long before.
+pub(crate) fn check_intrinsics(camera: &Intrinsics) -> Result<(), (&'static str, String, String)> {
     let sides = 1..=MAX_SIDE_PX;
     if !sides.contains(&camera.width) || !sides.contains(&camera.height) {
-        return Err(("size", format!("{} x {}", camera.width, camera.height), "1 to 16384 pixels a side"));
+        return Err(("size", format!("{} x {}", camera.width, camera.height), "1 to 16384 pixels a side".to_owned()));
     }
-    if ![camera.fx, camera.fy].iter().all(|f| f.is_finite() && *f > 0.0) {
-        return Err(("focal length", format!("{} and {}", camera.fx, camera.fy), "a finite number above 0"));
+    let width = f64::from(camera.width);
+    let focal = 1e-3 * width..=1e3 * width;
+    if ![camera.fx, camera.fy].iter().all(|f| focal.contains(f)) {
+        let expected = format!("{} to {} pixels (0.001 to 1000 times the width)", focal.start(), focal.end());
+        return Err(("focal length", format!("{} and {}", camera.fx, camera.fy), expected));
     }
-    if ![camera.cx, camera.cy].iter().all(|c| c.is_finite()) {
-        return Err(("principal point", format!("{} and {}", camera.cx, camera.cy), "finite numbers"));
+    for (center, side) in [(camera.cx, camera.width), (camera.cy, camera.height)] {
+        let inside = -10.0 * width..=f64::from(side) + 10.0 * width;
+        if !inside.contains(&center) {
+            let expected = format!("{} to {} pixels (10 widths outside of the image)", inside.start(), inside.end());
+            return Err(("principal point", format!("{} and {}", camera.cx, camera.cy), expected));
+        }
     }
     Ok(())
 }

@@ -109,8 +109,10 @@ fn list_frames(
     held_out: Option<bool>,
     entries: &mut Vec<Entry>,
 ) -> Result<(), DatasetError> {
-    let Some(frames) = document.get("frames").and_then(Value::as_array) else {
-        return Err(DatasetError::damaged(path, "frames", "missing", "a list of frames"));
+    let frames = match document.get("frames") {
+        Some(Value::Array(frames)) => frames,
+        Some(other) => return Err(DatasetError::damaged(path, "frames", other.to_string(), "a list of frames")),
+        None => return Err(DatasetError::damaged(path, "frames", "missing", "a list of frames")),
     };
     for (index, frame) in frames.iter().enumerate() {
         let Value::Object(frame) = frame else {
@@ -182,10 +184,8 @@ fn check_model(frame: &Frame<'_>) -> Result<(), DatasetError> {
 fn depth_unit(frame: &Frame<'_>) -> Result<f64, DatasetError> {
     for key in ["depth_unit_m", "depth_unit_scale_factor"] {
         if let Some(unit) = frame.number(key)? {
-            if unit > 0.0 {
-                return Ok(unit);
-            }
-            return Err(frame.wrong(key, unit.to_string(), "metres a unit of depth, above 0"));
+            super::check_depth_unit(unit).map_err(|expected| frame.wrong(key, unit.to_string(), expected))?;
+            return Ok(unit);
         }
     }
     Ok(DEPTH_UNIT_M)
@@ -234,6 +234,9 @@ fn pose_of(frame: &Frame<'_>) -> Result<Pose, DatasetError> {
     if rows.get(3).is_some_and(|last| last.iter().zip([0.0, 0.0, 0.0, 1.0]).any(|(a, b)| (a - b).abs() > 1e-6)) {
         return Err(frame.wrong(KEY, format!("with the last row {:?}", rows[3]), "the last row 0 0 0 1"));
     }
+    super::check_position(DVec3::new(rows[0][3], rows[1][3], rows[2][3])).map_err(|expected| {
+        frame.wrong(KEY, format!("with the position {:?}", [rows[0][3], rows[1][3], rows[2][3]]), expected)
+    })?;
     let column = |k: usize| DVec3::new(rows[0][k], rows[1][k], rows[2][k]);
     let axes = [column(0), column(1), column(2)];
     let rotation = DMat3::from_cols(axes[0], axes[1], axes[2]);

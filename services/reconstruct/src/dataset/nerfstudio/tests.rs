@@ -91,7 +91,8 @@ fn what_is_wrong_is_named_with_its_frame_and_field() {
     let mirrored = rows([-1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0], [0.0; 3]);
     let singular = rows([1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0; 3]);
     let cases = [
-        ("/frames", json!({}), "frames is missing"),
+        ("/frames", json!({}), "frames is {}; expected a list of frames"),
+        ("/frames", json!("x"), "frames is \"x\"; expected a list of frames"),
         ("/frames", json!([]), "0 usable images"),
         ("/frames/0", json!(7), "frames[0] is 7"),
         ("/frames/0/file_path", json!("images/none.png"), "none.png does not exist"),
@@ -110,6 +111,15 @@ fn what_is_wrong_is_named_with_its_frame_and_field() {
         ("/frames/1/file_path", json!("images/b.png"), "twice"),
         ("/ply_file_path", json!("none.ply"), "none.ply does not exist"),
         ("/depth_unit_m", json!(0.0), "depth_unit_m is 0"),
+        ("/depth_unit_m", json!(1e-7), "expected metres a unit of depth, 1e-6 to 1"),
+        ("/depth_unit_m", json!(1000.0), "depth_unit_m is 1000;"),
+        ("/fl_x", json!(1e300), "expected 0.008 to 8000 pixels"),
+        ("/cx", json!(1e300), "frames[0].principal point"),
+        (
+            "/frames/0/transform_matrix",
+            rows([1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0], [0.0, 2e6, 0.0]),
+            "from -1000000 to 1000000",
+        ),
     ];
     for (pointer, value, expected) in cases {
         let message = with(pointer, value);
