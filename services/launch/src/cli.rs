@@ -179,11 +179,11 @@ pub struct Doctor {
 pub struct Evaluate {
     /// The mission folder.
     pub folder: PathBuf,
-    /// Held-out views, both radii together; default: launch.evaluate_views. Other numbers than the default are only printed.
-    #[arg(long, value_name = "N")]
+    /// Held-out views, both radii together, 2 to 1000; default: launch.evaluate_views. Other numbers are only printed.
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(2..=1000))]
     pub views: Option<u32>,
-    /// Width of the held-out views, pixels; default: model.width. Another than the default is only printed.
-    #[arg(long, value_name = "PIXELS")]
+    /// Width of the held-out views, 32 to 4096 pixels; default: model.width. Another than the default is only printed.
+    #[arg(long, value_name = "PIXELS", value_parser = clap::value_parser!(u32).range(32..=4096))]
     pub width: Option<u32>,
     /// Model to measure instead of the mission's own (.ply, .splat, .spz or .glb).
     #[arg(long, value_name = "FILE")]
@@ -218,7 +218,7 @@ pub enum Format {
     Spz,
     /// The model as binary glTF with KHR_gaussian_splatting.
     Glb,
-    /// The views as a COLMAP text model.
+    /// The views as a COLMAP model, text and binary.
     Colmap,
     /// The views as a nerfstudio transforms.json.
     Nerfstudio,
@@ -229,7 +229,7 @@ pub enum Format {
 pub struct Reconstruct {
     /// The dataset: a mission folder, a folder with COLMAP's sparse/0 and images, or one with transforms.json.
     pub folder: PathBuf,
-    /// Training iterations.
+    /// Training iterations, 1 to 10000000.
     #[arg(long, default_value_t = 7_000, value_name = "N")]
     pub iterations: u32,
     /// Where results go; default: <folder>/reconstruct.
@@ -241,7 +241,7 @@ pub struct Reconstruct {
     /// How Gaussians are added and removed; default: none for a mission, whose depth seeds them, else default (3DGS).
     #[arg(long, value_enum)]
     pub strategy: Option<Strategy>,
-    /// Most Gaussians.
+    /// Most Gaussians, 16 to 20000000.
     #[arg(long, default_value_t = 1_000_000, value_name = "N")]
     pub max_gaussians: usize,
     /// Highest degree of spherical harmonics, 0 to 3.
@@ -250,13 +250,13 @@ pub struct Reconstruct {
     /// Seed of everything random.
     #[arg(long, default_value_t = 0, value_name = "N")]
     pub seed: u64,
-    /// Threads; 0: one per core. The result is the same for any number.
+    /// Threads, at most four per core and 256; 0: one per core. The result is the same for any number.
     #[arg(long, default_value_t = 0, value_name = "N")]
     pub threads: usize,
     /// Iterations between two evaluations on the held-out images, besides 7000, 30000 and the last; 0: those only.
     #[arg(long, default_value_t = 1_000, value_name = "N")]
     pub eval_every: u32,
-    /// Every how many-th image is held out, by name; 0: none.
+    /// Every how many-th image is held out, by name, 2 or more; 0: none.
     #[arg(long, default_value_t = 8, value_name = "N")]
     pub hold_out: usize,
     /// Colour behind the model; default: grey for a mission, else black.
@@ -265,7 +265,7 @@ pub struct Reconstruct {
     /// What pixels outside of masks and alpha channels are.
     #[arg(long, value_enum, default_value_t = Mask::Auto)]
     pub mask: Mask,
-    /// Whole number by which images are shrunk; default: a mission's training size, else until none is wider than 1600.
+    /// Whole number by which images are shrunk, 1 to 64; default: a mission's training size, else until none is wider than 1600.
     #[arg(long, value_name = "N")]
     pub downscale: Option<u32>,
     /// Folder of a COLMAP dataset's images, such as images_2; cameras are scaled to it. Default: images.

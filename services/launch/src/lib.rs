@@ -54,10 +54,23 @@ pub fn main() -> ExitCode {
     match run(&cli.command) {
         Ok(exit) => exit.into(),
         Err(error) => {
-            say(&format!("vantage: {error:#}"));
+            say(&format!("vantage: {}", told(&error)));
             exit_of(&error).into()
         }
     }
+}
+
+/// An error with its causes, less those that the message before them ends with already.
+fn told(error: &anyhow::Error) -> String {
+    let mut text = String::new();
+    for cause in error.chain().map(ToString::to_string) {
+        if text.is_empty() {
+            text = cause;
+        } else if !text.contains(&cause) {
+            text = format!("{text}: {cause}");
+        }
+    }
+    text
 }
 
 fn run(command: &Command) -> anyhow::Result<Exit> {
@@ -101,7 +114,10 @@ fn export_any(arguments: &cli::Export) -> anyhow::Result<Exit> {
         let folder = MissionFolder::open(source)?;
         let out = arguments.output.clone().unwrap_or_else(|| folder.root().join("export").join(name));
         if let Some(parent) = out.parent() {
-            std::fs::create_dir_all(parent)?;
+            std::fs::create_dir_all(parent).map_err(|error| {
+                let way_out = "give another place with --output";
+                exit::Refusal::missing(format!("cannot make the folder {}: {error}; {way_out}", parent.display()))
+            })?;
         }
         (export::export(&folder, format, &out), out)
     };
@@ -136,5 +152,19 @@ pub(crate) fn print(text: &str) -> anyhow::Result<Exit> {
     match std::io::stdout().write_all(text.as_bytes()) {
         Err(error) if error.kind() != std::io::ErrorKind::BrokenPipe => Err(error.into()),
         _ => Ok(Exit::Ok),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use anyhow::Context as _;
+    use shared_types::folder::FolderError;
+
+    #[test]
+    fn a_reason_is_told_once() {
+        let source = std::io::Error::other("the disk is on fire");
+        let error = FolderError::Io { action: "write", path: "a.ply".into(), source };
+        let error = Err::<(), _>(error).context("exporting").expect_err("an error");
+        assert_eq!(super::told(&error), "exporting: cannot write a.ply: the disk is on fire");
     }
 }

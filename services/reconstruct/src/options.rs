@@ -134,7 +134,8 @@ impl Options {
         let cores = cores();
         if self.threads > most_threads(cores) {
             let most = most_threads(cores);
-            let expected = format!("0 (one per core) to {most}: 4 for each of the {cores} cores here, at most {MOST_THREADS}");
+            let expected =
+                format!("0 (one per core) to {most}: 4 for each of the {cores} cores here, at most {MOST_THREADS}");
             return no("--threads", self.threads.to_string(), &expected);
         }
         if self.downscale.is_some_and(|factor| !(1..=64).contains(&factor)) {
@@ -232,7 +233,21 @@ impl Identity {
         fields
             .iter()
             .find(|(name, value)| there.get(name.as_str()) != Some(value))
-            .map(|(name, value)| (name.clone(), value.to_string(), there[name.as_str()].to_string()))
+            .map(|(name, value)| (named(name), value.to_string(), there[name.as_str()].to_string()))
+    }
+}
+
+/// What decides a field of an identity, as the user knows it.
+fn named(field: &str) -> String {
+    match field {
+        "fingerprint" => {
+            "content of the dataset (its images, masks, cameras or points, or --mask or --images)".to_owned()
+        }
+        "training" | "held_out" => format!("number of {field} images (of the dataset, or --hold-out)"),
+        "iterations" | "strategy" | "max_gaussians" | "sh_degree" | "seed" | "downscale" | "background" => {
+            format!("--{}", field.replace('_', "-"))
+        }
+        other => other.replace('_', " "),
     }
 }
 
@@ -283,6 +298,6 @@ mod tests {
         assert_eq!(one.difference(&one.clone()), None);
         let other = Identity { strategy: StrategyName::None, ..one.clone() };
         let difference = one.difference(&other).expect("differs");
-        assert_eq!(difference, ("strategy".to_owned(), "\"mcmc\"".to_owned(), "\"none\"".to_owned()));
+        assert_eq!(difference, ("--strategy".to_owned(), "\"mcmc\"".to_owned(), "\"none\"".to_owned()));
     }
 }

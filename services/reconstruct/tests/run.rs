@@ -199,12 +199,12 @@ fn a_folder_with_another_run_is_not_gone_on_with() {
     cut_off(&options, |event| matches!(event, Event::Evaluated(row) if row.iteration == 300));
     let other = Options { iterations: 800, ..options.clone() };
     let message = refused(&other).to_string();
-    assert!(message.contains("another iterations (700 there, 800 now)"), "{message}");
+    assert!(message.contains("another --iterations (700 there, 800 now)"), "{message}");
     // Another image under the same name.
     let changed = image::RgbImage::new(SIZE.0, SIZE.1);
     changed.save(dir.path().join("images/003.png")).expect("saved");
     let message = refused(&options).to_string();
-    assert!(message.contains("another fingerprint"), "{message}");
+    assert!(message.contains("another content of the dataset"), "{message}");
     let report = finish(&Options { overwrite: true, iterations: 20, ..options });
     assert_eq!(report.evaluations.first().map(|row| row.iteration), Some(0), "begun anew");
 }

@@ -35,7 +35,7 @@ pub enum FolderError {
         source: std::io::Error,
     },
     /// No room for a file; nothing of it was left behind.
-    #[error("no room for {path} ({bytes} bytes): free disk space, or choose another folder with --output: {source}")]
+    #[error("no room for {path} ({bytes} bytes): free disk space, or choose another output folder: {source}")]
     Full {
         /// The file that does not fit.
         path: PathBuf,

@@ -56,10 +56,10 @@ pub fn run(arguments: &Evaluate) -> anyhow::Result<Exit> {
     let official = Effort::of(&config);
     let mut effort = official;
     if let Some(views) = arguments.views {
-        effort.views = views.clamp(2, 1000) as usize;
+        effort.views = views as usize;
     }
     if let Some(width) = arguments.width {
-        effort.width = width.clamp(32, 4096);
+        effort.width = width;
         effort.height = (effort.width * config.camera.height_px).div_ceil(config.camera.width_px.max(1)).max(1);
     }
     let mut metrics = measure(&folder, &config, effort, arguments.model.as_deref())?;
@@ -85,6 +85,12 @@ pub fn measure(
     model: Option<&Path>,
 ) -> anyhow::Result<Metrics> {
     let own = folder.model_path().join("model.ply");
+    if let Some(model) = model
+        && !model.exists()
+    {
+        let message = format!("{} does not exist; give a model file with --model", model.display());
+        return Err(Refusal::missing(message));
+    }
     let gaussians = read_model(model.unwrap_or(&own))?;
     let mut metrics = Metrics::of_folder(config, &flight::read(folder)?, &journal::read(&folder.journal_path())?);
     metrics.mission.backend = Some(Record::read(&folder.model_path()).backend).filter(|name| !name.is_empty());
