@@ -271,8 +271,16 @@ fn classes_of(
     }
     if let Some(path) = &entry.mask {
         let decoded = decode(path)?;
-        check_size(path, (decoded.width(), decoded.height()), entry)?;
-        let inside = mostly_white(&decoded.into_luma8().into_raw(), width, height, downscale);
+        let found = (decoded.width(), decoded.height());
+        if !is_enlarged(found, (width, height)) {
+            let expected = format!(
+                "{width} x {height} as its image has, or that enlarged with the same ratio of the sides: make the mask \
+                 anew at that size, or give --mask off"
+            );
+            return Err(DatasetError::damaged(path, "size", format!("{} x {}", found.0, found.1), expected));
+        }
+        let values = box_mean(&decoded.into_luma8().into_raw(), found, (width, height));
+        let inside = mostly_white(&values, width, height, downscale);
         let classes = classes.get_or_insert_with(|| vec![PixelClass::Foreground; inside.len()]);
         for (class, inside) in classes.iter_mut().zip(inside) {
             if !inside {
@@ -281,6 +289,39 @@ fn classes_of(
         }
     }
     Ok(classes)
+}
+
+/// Whether a mask shows what an image of a size shows, at that size or a larger one, up to the rounding of a pixel: masks are
+/// often kept beside the original images only, of which `images_2` holds the halves.
+fn is_enlarged(mask: (u32, u32), image: (u32, u32)) -> bool {
+    let [x, y] = [(mask.0, image.0), (mask.1, image.1)].map(|(from, to)| f64::from(from) / f64::from(to));
+    let off_px = ((x / y - 1.0) * f64::from(image.0)).abs().min(((y / x - 1.0) * f64::from(image.1)).abs());
+    // A mask that is a pixel larger belongs to another image.
+    mask == image || (x.min(y) >= 1.25 && off_px <= 1.0)
+}
+
+/// Values shrunk to a size: means over the pixels that lie in each of its own.
+fn box_mean(values: &[u8], (from_w, from_h): (u32, u32), (width, height): (u32, u32)) -> Vec<u8> {
+    if (from_w, from_h) == (width, height) {
+        return values.to_vec();
+    }
+    // Whole pixels, at least one, beginning where the small pixel begins.
+    let span = |at: u32, from: u32, to: u32| {
+        let edge = |at: u32| (u64::from(at) * u64::from(from) / u64::from(to)) as usize;
+        edge(at)..edge(at + 1).max(edge(at) + 1)
+    };
+    let mut small = Vec::with_capacity(width as usize * height as usize);
+    for row in 0..height {
+        let rows = span(row, from_h, height);
+        for column in 0..width {
+            let columns = span(column, from_w, width);
+            let pixels = rows.clone().flat_map(|y| &values[y * from_w as usize..][columns.clone()]);
+            let sum: u64 = pixels.map(|&value| u64::from(value)).sum();
+            let count = (rows.len() * columns.len()) as u64;
+            small.push(u8::try_from((sum + count / 2) / count).unwrap_or(u8::MAX));
+        }
+    }
+    small
 }
 
 /// Whether the mean of each box of pixels is at least half of white.

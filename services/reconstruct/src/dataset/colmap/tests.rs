@@ -224,6 +224,31 @@ fn smaller_images_take_scaled_cameras_where_they_are_asked_for() {
 }
 
 #[test]
+fn masks_of_the_original_size_serve_smaller_images() {
+    use splatting::PixelClass::{Foreground, Ignored};
+    let dir = tempfile::tempdir().expect("folder");
+    let root = binary_dataset(dir.path(), &scene().binary());
+    write_images(&root.join("images_2"), &["b.png", "a c.png"], (4, 3));
+    fs::create_dir_all(root.join("masks")).expect("folder");
+    let mask = |width, height| {
+        ::image::GrayImage::from_fn(width, height, |x, _| ::image::Luma([if x < width / 2 { 0 } else { 255 }]))
+            .save(root.join("masks/b.png.png"))
+            .expect("saved");
+        let listing = dataset::list(&root, Some("images_2")).expect("listed");
+        let options = dataset::LoadOptions { downscale: None, mask: dataset::MaskUse::Auto, memory_bytes: 1 << 20 };
+        dataset::load(&listing, &options).map(|dataset| dataset.images[1].classes.clone().expect("classes"))
+    };
+    let half = [Ignored, Ignored, Foreground, Foreground];
+    for size in [(8, 6), (4, 3), (9, 6), (10, 8)] {
+        assert_eq!(mask(size.0, size.1).expect("a whole or nearly whole ratio")[4..8], half, "{size:?}");
+    }
+    for size in [(8, 3), (2, 2), (6, 8)] {
+        let message = mask(size.0, size.1).expect_err("another shape, or too small").to_string();
+        assert!(message.contains("b.png.png") && message.contains("--mask off"), "{message}");
+    }
+}
+
+#[test]
 fn broken_images_are_named() {
     let dir = tempfile::tempdir().expect("folder");
     let root = binary_dataset(dir.path(), &scene().binary());
