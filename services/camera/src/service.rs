@@ -2,7 +2,8 @@
 //!
 //! In lockstep a tick is held until an image that decides something has come and a keyframe is on the disk, so that what
 //! other members see does not depend on how fast this machine is. A world that does not answer is not waited for inside
-//! a tick for longer than [`HOLD`]: the camera then waits at the view, tick after tick, until it is back.
+//! a tick for longer than [`HOLD`]: the camera then waits at the view, tick after tick, until it is back. Those ticks take
+//! as long as on a vehicle, for deadlines in mission time would else pass before any service could be started again.
 
 mod storing;
 
@@ -79,6 +80,8 @@ struct Core {
     progress: u64,
     last_error: String,
     world_error: String,
+    /// The present tick, and when its first turn began.
+    tick: (u64, Instant),
     failed: Option<ServiceError>,
 }
 
@@ -131,6 +134,7 @@ impl CameraService {
             progress: 0,
             last_error: String::new(),
             world_error: String::new(),
+            tick: (0, Instant::now()),
             failed: None,
             config,
         };
@@ -157,6 +161,9 @@ impl CameraService {
 
 impl Service for CameraService {
     fn step(&mut self, now_ns: u64) -> Result<Step, ServiceError> {
+        if self.core.tick.0 != now_ns {
+            self.core.tick = (now_ns, Instant::now());
+        }
         let locked = self.core.exposure_locked;
         self.core.take_mission(now_ns)?;
         if self.core.exposure_locked != locked {
@@ -482,10 +489,15 @@ impl Core {
                 tracing::warn!(stamp_ns = in_flight.stamp_ns, "the world does not answer; waiting at the view");
             }
         }
-        // A world that has let one tick pass is not waited for inside another until it answers.
-        let awaited =
-            self.world_error.is_empty() && [&self.capture, &self.depth].into_iter().flatten().any(InFlight::holds);
-        self.lockstep && (awaited || self.writing)
+        // A world that has let one tick pass is not waited for inside another until it answers; time only keeps to the
+        // wall's meanwhile.
+        let mut awaited = [&self.capture, &self.depth].into_iter().flatten();
+        let holds = if self.world_error.is_empty() {
+            awaited.any(InFlight::holds)
+        } else {
+            awaited.next().is_some() && self.tick.1.elapsed() < Duration::from_nanos(TICK_NS)
+        };
+        self.lockstep && (holds || self.writing)
     }
 }
 
