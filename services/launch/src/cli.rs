@@ -250,9 +250,18 @@ pub struct Reconstruct {
     /// Seed of everything random.
     #[arg(long, default_value_t = 0, value_name = "N")]
     pub seed: u64,
-    /// Threads, at most four per core and 256; 0: one per core. The result is the same for any number.
+    /// Threads of the CPU, at most four per core and 256; 0: one per core. The result is the same for any number.
     #[arg(long, default_value_t = 0, value_name = "N")]
     pub threads: usize,
+    /// What trains: auto (a GPU where there is a real one, else the CPU), cpu or gpu. A run may go on on another.
+    #[arg(long, value_enum, default_value_t = Backend::Auto)]
+    pub backend: Backend,
+    /// Name of the GPU, or a part of it; `vantage doctor` lists them. Default: the best that is not software.
+    #[arg(long, value_name = "NAME")]
+    pub adapter: Option<String>,
+    /// Give sums on a GPU an order, so that a run repeats bit for bit, as on the CPU it always does; costs memory and time.
+    #[arg(long)]
+    pub deterministic: bool,
     /// Iterations between two evaluations on the held-out images, besides 7000, 30000 and the last; 0: those only.
     #[arg(long, default_value_t = 1_000, value_name = "N")]
     pub eval_every: u32,
@@ -283,6 +292,17 @@ pub struct Reconstruct {
     /// Print metrics.json instead of a table.
     #[arg(long)]
     pub json: bool,
+}
+
+/// What trains.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum Backend {
+    /// A GPU where there is a real one, else the CPU.
+    Auto,
+    /// The CPU.
+    Cpu,
+    /// A GPU, or an error.
+    Gpu,
 }
 
 /// How the number of Gaussians changes.

@@ -108,6 +108,13 @@ fn options_of(arguments: &cli::Reconstruct) -> Options {
         sh_degree: arguments.sh_degree,
         seed: arguments.seed,
         threads: arguments.threads,
+        backend: match arguments.backend {
+            cli::Backend::Auto => splatting::BackendKind::Auto,
+            cli::Backend::Cpu => splatting::BackendKind::Cpu,
+            cli::Backend::Gpu => splatting::BackendKind::Gpu,
+        },
+        adapter: arguments.adapter.clone(),
+        deterministic: arguments.deterministic,
         eval_every: arguments.eval_every,
         background: arguments.background.map(|background| match background {
             cli::Background::Black => reconstruct::Background::Black,
@@ -186,6 +193,7 @@ fn table(report: &Report, offline: Option<&Offline>, out: &Path) -> String {
     let mut rows: Vec<(String, String)> = vec![
         ("iterations".to_owned(), report.run.iterations.to_string()),
         ("Gaussians".to_owned(), report.gaussians.to_string()),
+        ("trained by".to_owned(), report.backends.join(", then ")),
         ("iterations a second".to_owned(), format!("{:.1}", report.iterations_per_s)),
         ("processor time an iteration".to_owned(), format!("{:.1} ms", report.cpu_ms_per_iteration)),
     ];

@@ -10,12 +10,12 @@ use std::path::{Path, PathBuf};
 use shared_types::folder::{FolderError, write_atomic};
 use splatting::bytes::{Reader, Truncated, Writer, checksum};
 use splatting::order::ViewOrder;
-use splatting::{DensifierState, Gaussians, Optimiser, ScreenStatistics};
+use splatting::{DensifierState, Gaussians, Optimiser, ScreenStatistics, Training};
 
 use crate::report::Row;
 
 const MAGIC: u64 = u64::from_le_bytes(*b"VNTGRECO");
-const VERSION: u32 = 1;
+const VERSION: u32 = 2;
 /// Checkpoints kept.
 const KEPT: usize = 2;
 
@@ -59,6 +59,8 @@ pub struct Progression {
     pub wall_s: f64,
     /// The densifier.
     pub densifier: DensifierState,
+    /// What trained so far, one after the other.
+    pub backends: Vec<String>,
 }
 
 /// All of a run's state.
@@ -74,10 +76,10 @@ pub struct State {
     pub progression: Progression,
 }
 
-/// The bytes of a state; `run` is the checksum of the run's identity.
+/// The bytes of a model under training, as of its last [`Training::sync`], and of how far it is; `run` is the checksum of
+/// the run's identity.
 #[must_use]
-pub fn to_bytes(state: &State, run: u64) -> Vec<u8> {
-    let p = &state.progression;
+pub fn to_bytes(training: &Training, p: &Progression, run: u64) -> Vec<u8> {
     let mut w = Writer::default();
     w.u64(MAGIC);
     w.u32(VERSION);
@@ -92,8 +94,9 @@ pub fn to_bytes(state: &State, run: u64) -> Vec<u8> {
     w.f64(p.cpu_s);
     w.f64(p.wall_s);
     w.blob(&p.densifier.to_bytes());
-    w.blob(&state.statistics.encode());
-    w.blob(&splatting::checkpoint::encode(&state.model, &state.optimiser));
+    w.list(p.backends.iter(), |w, name| w.blob(name.as_bytes()));
+    w.blob(&training.statistics().encode());
+    w.blob(&splatting::checkpoint::encode(training.model(), training.optimiser()));
     let mut bytes = w.into_bytes();
     let sum = checksum(&bytes);
     bytes.extend_from_slice(&sum.to_le_bytes());
@@ -127,6 +130,7 @@ pub fn from_bytes(bytes: &[u8], run: u64) -> Result<State, CheckpointError> {
     let (cpu_s, wall_s) = (r.f64("processor time")?, r.f64("wall time")?);
     let densifier = r.blob("the densifier")?;
     let densifier = densifier.try_into().map_err(|_length| Truncated { at: bytes.len(), what: "the densifier" })?;
+    let backends = r.list("back ends", 8, |r| Ok(String::from_utf8_lossy(r.blob("a back end")?).into_owned()))?;
     let statistics = r.blob("statistics")?;
     let blob = r.blob("the model")?;
     let (model, optimiser) =
@@ -146,6 +150,7 @@ pub fn from_bytes(bytes: &[u8], run: u64) -> Result<State, CheckpointError> {
             cpu_s,
             wall_s,
             densifier: DensifierState::from_bytes(densifier),
+            backends,
         },
     })
 }
@@ -154,9 +159,9 @@ pub fn from_bytes(bytes: &[u8], run: u64) -> Result<State, CheckpointError> {
 ///
 /// # Errors
 /// When it cannot be written; older ones then still stand.
-pub fn write(folder: &Path, state: &State, run: u64) -> Result<PathBuf, FolderError> {
-    let path = folder.join(format!("checkpoint-{:09}.ckpt", state.progression.iteration));
-    write_atomic(&path, &to_bytes(state, run))?;
+pub fn write(folder: &Path, training: &Training, progression: &Progression, run: u64) -> Result<PathBuf, FolderError> {
+    let path = folder.join(format!("checkpoint-{:09}.ckpt", progression.iteration));
+    write_atomic(&path, &to_bytes(training, progression, run))?;
     for (_, old) in list(folder).into_iter().skip(KEPT) {
         if let Err(error) = fs::remove_file(&old) {
             tracing::warn!(path = %old.display(), %error, "cannot remove an old checkpoint");

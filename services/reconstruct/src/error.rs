@@ -265,6 +265,15 @@ pub enum ReconstructError {
     /// The renderer could not be started.
     #[error(transparent)]
     Engine(#[from] splatting::EngineError),
+    /// No back end as it was asked for.
+    #[error("{0} (--backend, --adapter)")]
+    NoBackend(splatting::BackendError),
+    /// The back end failed in training.
+    #[error(
+        "training failed: {0}; the run stands at its last checkpoint: repeat the command to go on from there, with \
+         --backend cpu to go on without the GPU"
+    )]
+    Backend(#[from] splatting::BackendError),
     /// A setting of the densification is out of range.
     #[error(transparent)]
     Densify(#[from] splatting::DensifyError),
@@ -336,7 +345,7 @@ impl ReconstructError {
             | Self::DamagedRun { .. }
             | Self::Busy { .. } => ErrorKind::Usage,
             Self::Write(error) => folder_kind(error),
-            Self::Output { .. } | Self::Engine(_) => ErrorKind::Missing,
+            Self::Output { .. } | Self::Engine(_) | Self::NoBackend(_) | Self::Backend(_) => ErrorKind::Missing,
             Self::View { .. } | Self::Empty { .. } => ErrorKind::Failed,
             Self::Picture { .. } | Self::Model { .. } | Self::Densify(_) => ErrorKind::Internal,
         }

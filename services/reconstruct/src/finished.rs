@@ -22,7 +22,6 @@ pub fn finished(options: &Options) -> Result<Option<Report>, ReconstructError> {
     let listing = dataset::list(&options.folder, options.images.as_deref())?;
     let split = split(&listing, options.hold_out)?;
     let dataset = dataset::load(&listing, &load_options(options))?;
-    let isa = format!("{:?}", splatting::Engine::new(1)?.isa());
-    let asked = Identity::of(options, &dataset, &split, strategy_for(options, &dataset), &isa);
+    let asked = Identity::of(options, &dataset, &split, strategy_for(options, &dataset));
     Ok((found == asked && report.run == asked).then_some(report))
 }

@@ -5,11 +5,13 @@
 //! - [`run`](mod@run): the loop; [`views`], [`evaluate`](mod@evaluate), [`progress`]: what it looks at and tells;
 //! - [`checkpoint`], [`output`], [`report`], [`picture`]: what it leaves; [`finished`](mod@finished): what was left.
 //!
-//! A library without a process of its own. The same seed gives the same bits for any number of threads, and a run that was
-//! killed goes on with the bits of one that never was.
+//! A library without a process of its own. On the CPU the same seed gives the same bits for any number of threads, and a
+//! run that was killed goes on with the bits of one that never was; so it does on a GPU where `deterministic` is set. A run
+//! may change its back end. Figures are measured by the CPU engine, whatever trained.
 #![forbid(unsafe_code)]
 
 pub mod checkpoint;
+mod clocks;
 pub mod dataset;
 pub mod error;
 pub mod evaluate;

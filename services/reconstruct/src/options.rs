@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use glam::Vec3;
 use serde::{Deserialize, Serialize};
-use splatting::SH_DEGREE_MAX;
+use splatting::{BackendKind, SH_DEGREE_MAX};
 
 use crate::dataset::{Dataset, MaskUse};
 use crate::error::ReconstructError;
@@ -68,6 +68,12 @@ pub struct Options {
     pub seed: u64,
     /// Threads; 0: one per core.
     pub threads: usize,
+    /// What trains.
+    pub backend: BackendKind,
+    /// Name of the GPU, or a part of it; `None`: the best.
+    pub adapter: Option<String>,
+    /// Whether sums on a GPU have an order, as they always do on the CPU.
+    pub deterministic: bool,
     /// Iterations between two evaluations on the held-out images, besides 7,000, 30,000 and the last; 0: those only.
     pub eval_every: u32,
     /// Colour behind the model; `None`: grey for a mission, else black.
@@ -102,6 +108,9 @@ impl Options {
             sh_degree: SH_DEGREE_MAX,
             seed: 0,
             threads: 0,
+            backend: BackendKind::Auto,
+            adapter: None,
+            deterministic: false,
             eval_every: 1_000,
             background: None,
             mask: MaskUse::Auto,
@@ -170,7 +179,7 @@ fn cores() -> usize {
 }
 
 /// Version of what a run computes: a run of another version is not gone on with.
-const FORMAT: u32 = 1;
+const FORMAT: u32 = 2;
 
 /// What decides the bits of a run, as `run.json` in its folder keeps it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -200,14 +209,12 @@ pub struct Identity {
     pub downscale: u32,
     /// Colour behind the model.
     pub background: Background,
-    /// Instruction set: the last bits differ between them.
-    pub instruction_set: String,
 }
 
 impl Identity {
     /// The identity of a run.
     #[must_use]
-    pub fn of(options: &Options, dataset: &Dataset, split: &Split, strategy: StrategyName, isa: &str) -> Self {
+    pub fn of(options: &Options, dataset: &Dataset, split: &Split, strategy: StrategyName) -> Self {
         Self {
             format: FORMAT,
             dataset: dataset.format.name().to_owned(),
@@ -221,7 +228,6 @@ impl Identity {
             seed: options.seed,
             downscale: dataset.downscale,
             background: options.background_for(dataset),
-            instruction_set: isa.to_owned(),
         }
     }
 
@@ -293,7 +299,6 @@ mod tests {
             seed: 0,
             downscale: 1,
             background: Background::Black,
-            instruction_set: "AVX2".to_owned(),
         };
         assert_eq!(one.difference(&one.clone()), None);
         let other = Identity { strategy: StrategyName::None, ..one.clone() };

@@ -118,6 +118,8 @@ pub struct Report {
     pub up: [f32; 3],
     /// Threads.
     pub threads: usize,
+    /// What trained, one after the other: instruction set of the CPU, or adapter.
+    pub backends: Vec<String>,
     /// Iterations a second of wall time.
     pub iterations_per_s: f64,
     /// Processor milliseconds an iteration.

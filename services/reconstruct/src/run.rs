@@ -5,15 +5,15 @@ use std::ops::ControlFlow;
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
-use rustix::time::{ClockId, clock_gettime};
 use splatting::order::ViewOrder;
 use splatting::rgbd::prune::DepthView;
 use splatting::{
-    Densifier, Engine, Gaussians, InitialGaussians, Optimiser, ScreenStatistics, Strategy, TrainingSettings,
-    scene_extent,
+    Backend, BackendOptions, Densifier, InitialGaussians, Optimiser, ScreenStatistics, Strategy, Training,
+    TrainingSettings, scene_extent,
 };
 
 use crate::checkpoint::{self, Progression, State};
+use crate::clocks::{Rate, Watch};
 use crate::dataset::{self, Dataset, Image, LoadOptions};
 use crate::error::ReconstructError;
 use crate::evaluate::{PSNR_MAX_DB, evaluate};
@@ -33,8 +33,6 @@ const PSNR_IMAGES: usize = 100;
 const PUBLISHED: [u32; 2] = [7_000, 30_000];
 /// Wall time between two events of progress.
 const PROGRESS_PERIOD: Duration = Duration::from_millis(200);
-/// Wall time that the rate is a mean over.
-const RATE_WINDOW: Duration = Duration::from_secs(10);
 
 /// How a run ended.
 #[derive(Debug, Clone, PartialEq)]
@@ -79,19 +77,35 @@ pub fn run(options: &Options, observer: &mut dyn Observer) -> Result<Outcome, Re
         megabytes: dataset.bytes() as f64 / 1e6,
     };
     let mut flow = observer.on(&loaded);
-    let engine = Engine::new(options.thread_count())?;
+    let backend = backend(options)?;
     let strategy = strategy_for(options, &dataset);
-    let identity = Identity::of(options, &dataset, &split, strategy, &format!("{:?}", engine.isa()));
+    let identity = Identity::of(options, &dataset, &split, strategy);
     let resumed = output.admit(&identity, options.overwrite)?;
-    let mut run = Run::new(options, &dataset, &split, engine, output, identity, memory_bytes, resumed)?;
+    let mut run = Run::new(options, &dataset, &split, backend, output, identity, memory_bytes, resumed)?;
     if run.resumed {
-        flow = both(flow, observer.on(&Event::Resumed { iteration: run.state.progression.iteration }));
+        flow = both(flow, observer.on(&Event::Resumed { iteration: run.progression.iteration }));
     } else {
-        let began = Event::Began { origin: run.origin.name(), gaussians: run.state.model.len() };
+        let began = Event::Began { origin: run.origin.name(), gaussians: run.training.model().len() };
         flow = both(flow, observer.on(&began));
         flow = both(flow, run.evaluate(observer)?);
     }
     run.train(observer, flow)
+}
+
+/// What trains.
+fn backend(options: &Options) -> Result<Backend, ReconstructError> {
+    let wanted = BackendOptions {
+        kind: options.backend,
+        adapter: options.adapter.clone(),
+        deterministic: options.deterministic,
+        threads: options.thread_count(),
+    };
+    let (backend, why_not_gpu) = Backend::new(&wanted).map_err(ReconstructError::NoBackend)?;
+    match why_not_gpu {
+        Some(reason) => tracing::info!(%backend, %reason, "training"),
+        None => tracing::info!(%backend, "training"),
+    }
+    Ok(backend)
 }
 
 /// How a run's images are brought into memory.
@@ -110,10 +124,12 @@ struct Run<'a> {
     dataset: &'a Dataset,
     held_out: Vec<&'a Image>,
     views: Views<'a>,
-    engine: Engine,
+    training: Training,
+    /// Whether the images of steps whose losses are not known yet have pixels that count.
+    outstanding: VecDeque<bool>,
     recipe: Recipe,
     densifier: Densifier,
-    state: State,
+    progression: Progression,
     output: Output,
     identity: Identity,
     run_sum: u64,
@@ -128,17 +144,17 @@ impl<'a> Run<'a> {
         options: &'a Options,
         dataset: &'a Dataset,
         split: &Split,
-        engine: Engine,
+        backend: Backend,
         output: Output,
         identity: Identity,
         memory_bytes: u64,
         resumed: Option<State>,
     ) -> Result<Self, ReconstructError> {
         let images = |indices: &[usize]| indices.iter().filter_map(|&i| dataset.images.get(i)).collect::<Vec<_>>();
-        let training = images(&split.training);
-        let extent_m = scene_extent(training.iter().map(|image| &image.camera)).unwrap_or(1.0);
+        let trained_on = images(&split.training);
+        let extent_m = scene_extent(trained_on.iter().map(|image| &image.camera)).unwrap_or(1.0);
         let recipe = Recipe::new(options, dataset, extent_m, start::voxel_m(dataset, &split.training));
-        let (state, origin, resumed) = match resumed {
+        let (mut state, origin, resumed) = match resumed {
             Some(state) => (state, start::origin(dataset, &split.training), true),
             None => {
                 let how = match recipe.strategy {
@@ -147,25 +163,32 @@ impl<'a> Run<'a> {
                 };
                 let bounds = (options.max_gaussians, options.sh_degree, options.seed);
                 let start = start::start(dataset, &split.training, how, bounds);
-                if !start::is_seen(&start.model, &training, recipe.render(0).near_m) {
+                if !start::is_seen(&start.model, &trained_on, recipe.render(0).near_m) {
                     let (gaussians, origin) = (start.model.len(), start.origin.name());
-                    return Err(ReconstructError::Unseen { gaussians, origin, images: training.len() });
+                    return Err(ReconstructError::Unseen { gaussians, origin, images: trained_on.len() });
                 }
                 let densifier = Densifier::new(recipe.strategy, extent_m, options.seed, &start.model)?;
-                (State::begin(start.model, &densifier, options.seed, training.len()), start.origin, false)
+                (State::begin(start.model, &densifier, options.seed, trained_on.len()), start.origin, false)
             }
         };
         let densifier = Densifier::resume(recipe.strategy, extent_m, state.progression.densifier)?;
+        let name = backend.to_string();
+        if state.progression.backends.last() != Some(&name) {
+            state.progression.backends.push(name);
+        }
+        let mut training = Training::new(backend);
+        training.restore_observed(state.model, state.optimiser, state.statistics);
         let held_out_psnr_db = state.progression.rows.last().and_then(|row| row.held_out_psnr_db);
         Ok(Self {
             options,
             dataset,
             held_out: images(&split.held_out),
-            views: Views::new(training, memory_bytes.saturating_sub(dataset.bytes())),
-            engine,
+            views: Views::new(trained_on, memory_bytes.saturating_sub(dataset.bytes())),
+            training,
+            outstanding: VecDeque::new(),
             recipe,
             densifier,
-            state,
+            progression: state.progression,
             run_sum: run_sum(&identity),
             output,
             identity,
@@ -180,18 +203,20 @@ impl<'a> Run<'a> {
         let mut watch = Watch::start();
         let mut checkpointed = Instant::now();
         let mut told = Instant::now();
-        let mut rate = Rate::new(self.state.progression.iteration);
-        while self.state.progression.iteration < iterations && flow.is_continue() {
+        let mut rate = Rate::new(self.progression.iteration);
+        while self.progression.iteration < iterations && flow.is_continue() {
             self.iterate()?;
-            let done = self.state.progression.iteration;
+            let done = self.progression.iteration;
             if self.is_evaluated(done) {
-                watch.stop(&mut self.state.progression);
+                self.sync()?;
+                watch.stop(&mut self.progression);
                 flow = both(flow, self.evaluate(observer)?);
                 watch = Watch::start();
                 rate = Rate::new(done);
             }
             if checkpointed.elapsed() >= self.options.checkpoint_period && done < iterations {
-                watch.stop(&mut self.state.progression);
+                self.sync()?;
+                watch.stop(&mut self.progression);
                 watch = Watch::start();
                 self.checkpoint()?;
                 checkpointed = Instant::now();
@@ -201,11 +226,12 @@ impl<'a> Run<'a> {
                 flow = both(flow, observer.on(&Event::Trained(self.progress(rate.at(done)))));
             }
         }
-        watch.stop(&mut self.state.progression);
+        self.sync()?;
+        watch.stop(&mut self.progression);
         // What is on disk goes on: also a run that was told to stop after its last iteration.
         self.checkpoint()?;
         if flow.is_break() {
-            let iteration = self.state.progression.iteration;
+            let iteration = self.progression.iteration;
             return Ok(Outcome::Stopped { iteration, iterations, out: self.output.root().to_owned() });
         }
         self.finish()
@@ -213,43 +239,65 @@ impl<'a> Run<'a> {
 
     /// One step, with what the strategy and a mission's rules do after it.
     fn iterate(&mut self) -> Result<(), ReconstructError> {
-        let iteration = self.state.progression.iteration;
+        let iteration = self.progression.iteration;
         let settings: TrainingSettings = self.recipe.settings(iteration);
-        let State { model, optimiser, statistics, progression } = &mut self.state;
-        let engine = &mut self.engine;
         let observes = self.densifier.observes(iteration);
-        let index = progression.order.next_view().unwrap_or(0) as usize;
-        let terms = self
+        let index = self.progression.order.next_view().unwrap_or(0) as usize;
+        let training = &mut self.training;
+        let (stepped, counts) = self
             .views
             .with(index, |view| {
-                let terms = if observes {
-                    engine.train_step_observed(model, optimiser, view, &settings, statistics)
-                } else {
-                    engine.train_step(model, optimiser, view, &settings)
-                };
-                (terms, view.foreground_pixels())
+                let stepped =
+                    if observes { training.step_observed(view, &settings) } else { training.step(view, &settings) };
+                (stepped, view.foreground_pixels() > 0)
             })
             .map_err(|(name, source)| ReconstructError::View { name, source })?;
-        if let (terms, 1..) = terms {
-            if progression.recent_psnr_db.len() == PSNR_IMAGES {
-                progression.recent_psnr_db.pop_front();
+        stepped?;
+        self.outstanding.push_back(counts);
+        self.densifier.after_step(iteration, &settings, training)?;
+        self.progression.iteration = iteration + 1;
+        if self.recipe.prunes(self.progression.iteration, self.options.iterations) {
+            self.prune()?;
+        }
+        if self.training.model().is_empty() {
+            return Err(ReconstructError::Empty { iteration: self.progression.iteration });
+        }
+        self.take_losses()
+    }
+
+    /// Takes away what a mission's rules say.
+    fn prune(&mut self) -> Result<(), ReconstructError> {
+        let views: Vec<DepthView<'_>> = self
+            .views
+            .images()
+            .iter()
+            .filter_map(|image| Some(DepthView { camera: &image.camera, depth_m: image.depth_m.as_deref()? }))
+            .collect();
+        let (model, optimiser, statistics) = self.training.lists_mut()?;
+        let kept = self.recipe.keep(model, &views);
+        let keep = |index: usize| kept.get(index).copied().unwrap_or(false);
+        model.retain(keep);
+        optimiser.retain(keep);
+        statistics.retain(keep);
+        Ok(())
+    }
+
+    /// Brings the newest model here, wherever it is trained.
+    fn sync(&mut self) -> Result<(), ReconstructError> {
+        self.training.sync()?;
+        self.take_losses()
+    }
+
+    /// Takes in the losses that are known by now.
+    fn take_losses(&mut self) -> Result<(), ReconstructError> {
+        let recent = &mut self.progression.recent_psnr_db;
+        for terms in self.training.finished()? {
+            if self.outstanding.pop_front() == Some(true) {
+                if recent.len() == PSNR_IMAGES {
+                    recent.pop_front();
+                }
+                recent.push_back(terms.foreground_psnr_db().min(PSNR_MAX_DB));
             }
-            progression.recent_psnr_db.push_back(terms.foreground_psnr_db().min(PSNR_MAX_DB));
-        }
-        self.densifier.after_step(engine, iteration, &settings, model, optimiser, statistics);
-        progression.iteration = iteration + 1;
-        if self.recipe.prunes(progression.iteration, self.options.iterations) {
-            let views: Vec<DepthView<'_>> = self
-                .views
-                .images()
-                .iter()
-                .filter_map(|image| Some(DepthView { camera: &image.camera, depth_m: image.depth_m.as_deref()? }))
-                .collect();
-            let kept = self.recipe.keep(model, &views);
-            retain(model, optimiser, statistics, &kept);
-        }
-        if model.is_empty() {
-            return Err(ReconstructError::Empty { iteration: progression.iteration });
         }
         Ok(())
     }
@@ -261,15 +309,15 @@ impl<'a> Run<'a> {
 
     /// Measures the model, and writes the curve so far.
     fn evaluate(&mut self, observer: &mut dyn Observer) -> Result<ControlFlow<()>, ReconstructError> {
-        let render = self.recipe.render(self.state.progression.iteration);
-        let quality = evaluate(&self.state.model, &self.held_out, &render, self.options.thread_count())?;
+        let render = self.recipe.render(self.progression.iteration);
+        let quality = evaluate(self.training.model(), &self.held_out, &render, self.options.thread_count())?;
         self.held_out_psnr_db = quality.map(|quality| quality.psnr_db);
-        let progression = &mut self.state.progression;
+        let progression = &mut self.progression;
         let row = Row {
             iteration: progression.iteration,
             cpu_s: progression.cpu_s,
             wall_s: progression.wall_s,
-            gaussians: self.state.model.len(),
+            gaussians: self.training.model().len(),
             train_psnr_db: mean(&progression.recent_psnr_db),
             held_out_psnr_db: None,
             held_out_ssim: None,
@@ -292,35 +340,35 @@ impl<'a> Run<'a> {
 
     fn progress(&self, per_s: f64) -> Progress {
         Progress {
-            iteration: self.state.progression.iteration,
+            iteration: self.progression.iteration,
             iterations: self.options.iterations,
             per_s,
-            train_psnr_db: mean(&self.state.progression.recent_psnr_db),
+            train_psnr_db: mean(&self.progression.recent_psnr_db),
             held_out_psnr_db: self.held_out_psnr_db,
-            gaussians: self.state.model.len(),
+            gaussians: self.training.model().len(),
         }
     }
 
     fn checkpoint(&mut self) -> Result<(), ReconstructError> {
-        self.state.progression.densifier = self.densifier.state();
-        checkpoint::write(self.output.root(), &self.state, self.run_sum)?;
+        self.progression.densifier = self.densifier.state();
+        checkpoint::write(self.output.root(), &self.training, &self.progression, self.run_sum)?;
         Ok(())
     }
 
     /// Writes the results; `metrics.json`, which says that they are there, last.
     fn finish(self) -> Result<Outcome, ReconstructError> {
-        let rows = &self.state.progression.rows;
-        let render = self.recipe.render(self.state.progression.iteration);
+        let rows = &self.progression.rows;
+        let render = self.recipe.render(self.progression.iteration);
         let mut ply = Vec::new();
         let path = self.output.path("model.ply");
-        splatting::ply::write(&self.state.model, &mut ply)
+        splatting::ply::write(self.training.model(), &mut ply)
             .map_err(|source| ReconstructError::Model { path: path.clone(), source })?;
         shared_types::folder::write_atomic(&path, &ply)?;
         drop(ply);
         let threads = self.options.thread_count();
         picture::write_curve(&self.output.path("curve.png"), rows)?;
         let held_out = self.output.path("held-out.png");
-        picture::write_held_out(&held_out, &self.state.model, &self.held_out, &render, threads)?;
+        picture::write_held_out(&held_out, self.training.model(), &self.held_out, &render, threads)?;
         let report = self.report();
         let json = serde_json::to_string_pretty(&report).unwrap_or_default() + "\n";
         shared_types::folder::write_atomic(&self.output.path("metrics.json"), json.as_bytes())?;
@@ -329,26 +377,27 @@ impl<'a> Run<'a> {
     }
 
     fn report(&self) -> Report {
-        let p = &self.state.progression;
+        let p = &self.progression;
         let widths = || self.dataset.images.iter().map(|image| image.camera.width);
         let iterations = f64::from(p.iteration.max(1));
         let megabytes = |bytes: u64| (bytes as f64 / 1e5).round() / 10.0;
-        let coefficients = 14 + 3 * splatting::sh_rest_coefficients(self.state.model.sh_degree());
+        let coefficients = 14 + 3 * splatting::sh_rest_coefficients(self.training.model().sh_degree());
         Report {
             run: self.identity.clone(),
             origin: self.origin.name().to_owned(),
             first_gaussians: p.rows.first().map_or(0, |row| row.gaussians),
-            gaussians: self.state.model.len(),
+            gaussians: self.training.model().len(),
             width_px: [widths().min().unwrap_or(0), widths().max().unwrap_or(0)],
             up: self.dataset.up.to_array(),
-            threads: self.engine.threads(),
+            threads: self.options.thread_count(),
+            backends: p.backends.clone(),
             iterations_per_s: iterations / p.wall_s.max(1e-9),
             cpu_ms_per_iteration: 1e3 * p.cpu_s / iterations,
             evaluations: p.rows.clone(),
             memory: Memory {
                 images_mb: megabytes(self.dataset.bytes()),
                 views_mb: megabytes(self.views.bytes_used()),
-                model_mb: megabytes((self.state.model.len() * (coefficients * 3 * 4 + 16)) as u64),
+                model_mb: megabytes((self.training.model().len() * (coefficients * 3 * 4 + 16)) as u64),
                 peak_rss_mb: peak_rss_bytes().map(megabytes),
             },
         }
@@ -356,7 +405,7 @@ impl<'a> Run<'a> {
 }
 
 impl State {
-    fn begin(model: Gaussians, densifier: &Densifier, seed: u64, views: usize) -> Self {
+    fn begin(model: splatting::Gaussians, densifier: &Densifier, seed: u64, views: usize) -> Self {
         Self {
             model,
             optimiser: Optimiser::new(),
@@ -369,67 +418,14 @@ impl State {
                 cpu_s: 0.0,
                 wall_s: 0.0,
                 densifier: densifier.state(),
+                backends: Vec::new(),
             },
         }
     }
 }
 
-fn retain(model: &mut Gaussians, optimiser: &mut Optimiser, statistics: &mut ScreenStatistics, kept: &[bool]) {
-    let keep = |index: usize| kept.get(index).copied().unwrap_or(false);
-    optimiser.fit(model);
-    statistics.fit(model);
-    model.retain(keep);
-    optimiser.retain(keep);
-    statistics.retain(keep);
-}
-
 fn mean(values: &VecDeque<f64>) -> Option<f64> {
     (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
-}
-
-/// Processor and wall time of training.
-struct Watch {
-    wall: Instant,
-    cpu_s: f64,
-}
-
-impl Watch {
-    fn start() -> Self {
-        Self { wall: Instant::now(), cpu_s: process_cpu_s() }
-    }
-
-    fn stop(self, progression: &mut Progression) {
-        progression.wall_s += self.wall.elapsed().as_secs_f64();
-        progression.cpu_s += process_cpu_s() - self.cpu_s;
-    }
-}
-
-/// Iterations a second of late.
-struct Rate {
-    marks: VecDeque<(Instant, u32)>,
-}
-
-impl Rate {
-    fn new(iteration: u32) -> Self {
-        Self { marks: VecDeque::from([(Instant::now(), iteration)]) }
-    }
-
-    fn at(&mut self, iteration: u32) -> f64 {
-        let now = Instant::now();
-        self.marks.push_back((now, iteration));
-        while self.marks.len() > 2 && self.marks.front().is_some_and(|mark| now - mark.0 > RATE_WINDOW) {
-            self.marks.pop_front();
-        }
-        self.marks.front().map_or(0.0, |(when, first)| {
-            f64::from(iteration.saturating_sub(*first)) / (now - *when).as_secs_f64().max(1e-9)
-        })
-    }
-}
-
-/// Processor time of all threads of this process, seconds.
-fn process_cpu_s() -> f64 {
-    let time = clock_gettime(ClockId::ProcessCPUTime);
-    time.tv_sec as f64 + time.tv_nsec as f64 * 1e-9
 }
 
 /// Half of what the machine has free; 1 GiB where it does not tell.

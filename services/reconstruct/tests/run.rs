@@ -10,7 +10,7 @@ use std::time::Duration;
 use glam::{Quat, Vec3};
 use reconstruct::{Event, Options, Outcome, ReconstructError, StrategyName};
 use splatting::order::Random;
-use splatting::{Camera, Engine, Gaussian, Gaussians, Pose, RenderSettings, Rendered};
+use splatting::{BackendKind, Camera, Engine, Gaussian, Gaussians, Pose, RenderSettings, Rendered};
 
 const SIZE: (u32, u32) = (48, 40);
 const VIEWS: u32 = 17;
@@ -80,6 +80,7 @@ fn options(root: &Path, out: &str) -> Options {
         max_gaussians: 3000,
         sh_degree: 1,
         threads: 1,
+        backend: BackendKind::Cpu,
         ..Options::new(root)
     }
 }
@@ -276,4 +277,41 @@ fn an_output_that_cannot_be_written_and_one_in_use_are_named() {
     };
     reconstruct::run(&options, &mut observer).expect("stops");
     assert!(busy.as_ref().is_some_and(|message| message.contains("another reconstruction runs")), "{busy:?}");
+}
+
+/// A run that was begun on the CPU goes on on a GPU, and is worth as much as on the CPU alone.
+#[test]
+fn a_run_changes_its_back_end() {
+    let Some(adapter) = splatting::gpu::adapters().into_iter().next() else {
+        assert!(std::env::var_os("VANTAGE_EXPECT_GPU").is_none(), "no GPU adapter, but one was expected");
+        println!("a_run_changes_its_back_end: skipped, no GPU adapter");
+        return;
+    };
+    for strategy in [StrategyName::Default, StrategyName::Mcmc] {
+        let dir = tempfile::tempdir().expect("folder");
+        scene(dir.path());
+        let with = |out| Options { strategy: Some(strategy), ..options(dir.path(), out) };
+        let whole = finish(&with("whole"));
+        let begun = with("changed");
+        cut_off(&begun, |event| matches!(event, Event::Evaluated(row) if row.iteration == 300));
+        let changed = Options { backend: BackendKind::Gpu, adapter: Some(adapter.name.clone()), ..begun };
+        let report = finish(&changed);
+        let [first, second] = &report.backends[..] else { panic!("{:?}", report.backends) };
+        assert!(first.starts_with("cpu-") && second.contains(&adapter.name), "{:?}", report.backends);
+        let psnr = |report: &reconstruct::report::Report| {
+            report.last().and_then(|row| row.held_out_psnr_db).expect("held out")
+        };
+        assert!((psnr(&whole) - psnr(&report)).abs() < 1.0, "{} dB and {} dB", psnr(&whole), psnr(&report));
+    }
+    let missing = Options { adapter: Some("No Such GPU 9000".to_owned()), ..options(Path::new("nowhere"), "out") };
+    let dir = tempfile::tempdir().expect("folder");
+    scene(dir.path());
+    let message = refused(&Options {
+        folder: dir.path().to_owned(),
+        out: dir.path().join("out"),
+        backend: BackendKind::Gpu,
+        ..missing
+    });
+    let message = message.to_string();
+    assert!(message.contains("No Such GPU 9000") && message.contains(&adapter.name), "{message}");
 }

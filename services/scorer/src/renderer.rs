@@ -6,7 +6,7 @@ use std::sync::atomic::{AtomicBool, AtomicU64};
 
 use shared_types::config::ScorerConfig;
 use shared_types::config::trainer::BackendWord;
-use splatting::{Backend, BackendError, BackendKind, Gaussians};
+use splatting::{Backend, BackendError, BackendKind, BackendOptions, Gaussians};
 
 use crate::job::{Job, Scores};
 
@@ -14,9 +14,7 @@ use crate::job::{Job, Scores};
 #[derive(Debug)]
 pub struct Renderer {
     backend: Backend,
-    kind: BackendKind,
-    adapter: Option<String>,
-    threads: usize,
+    wanted: BackendOptions,
     failures: u32,
 }
 
@@ -32,12 +30,14 @@ impl Renderer {
             BackendWord::Gpu => BackendKind::Gpu,
         };
         let adapter = Some(config.adapter.clone()).filter(|name| !name.is_empty());
-        let (backend, why_not_gpu) = Backend::new(kind, adapter.as_deref(), threads)?;
+        // Rendering adds nothing up out of order.
+        let wanted = BackendOptions { kind, adapter, deterministic: false, threads };
+        let (backend, why_not_gpu) = Backend::new(&wanted)?;
         match why_not_gpu {
             Some(reason) => tracing::info!(%backend, %reason, "scoring"),
             None => tracing::info!(%backend, "scoring"),
         }
-        Ok(Self { backend, kind, adapter, threads, failures: 0 })
+        Ok(Self { backend, wanted, failures: 0 })
     }
 
     /// What renders now.
@@ -64,11 +64,10 @@ impl Renderer {
 
     /// The same back end once more, then the CPU.
     fn replace(&mut self) -> Result<(), BackendError> {
-        let again = || Backend::new(self.kind, self.adapter.as_deref(), self.threads);
-        let fresh = if self.failures < 2 { again().ok() } else { None };
+        let fresh = if self.failures < 2 { Backend::new(&self.wanted).ok() } else { None };
         let (backend, _) = match fresh {
             Some(fresh) => fresh,
-            None => Backend::new(BackendKind::Cpu, None, self.threads)?,
+            None => Backend::new(&BackendOptions { kind: BackendKind::Cpu, ..self.wanted.clone() })?,
         };
         tracing::warn!(%backend, "scoring goes on");
         self.backend = backend;

@@ -6,12 +6,16 @@ use std::sync::atomic::AtomicBool;
 use thiserror::Error;
 
 use crate::camera::{Camera, RenderSettings};
+use crate::densify::Noise;
 use crate::engine::{Engine, EngineError, Moments, MomentsView, Rendered};
 use crate::gpu::{self, GpuError};
 use crate::model::Gaussians;
 use crate::optimiser::Optimiser;
 use crate::settings::{LossTerms, TrainingSettings};
+use crate::simd::Isa;
+use crate::statistics::ScreenStatistics;
 use crate::view::TrainingView;
+use crate::workers::Workers;
 
 /// What is asked for.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -23,6 +27,19 @@ pub enum BackendKind {
     Cpu,
     /// A GPU, or an error.
     Gpu,
+}
+
+/// Which back end, and how it is to work.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct BackendOptions {
+    /// Which.
+    pub kind: BackendKind,
+    /// Name of the GPU's adapter, or a part of it; `None`: the best that is not software.
+    pub adapter: Option<String>,
+    /// Whether sums on a GPU have an order, so that training repeats bit for bit; on the CPU it always does.
+    pub deterministic: bool,
+    /// Threads of the CPU engine.
+    pub threads: usize,
 }
 
 /// Why a back end cannot be had, or stopped working.
@@ -87,26 +104,22 @@ impl From<Engine> for Backend {
 }
 
 impl Backend {
-    /// The back end that is asked for: a GPU by the name of its adapter (a part of it is enough) where one is given, and
-    /// `threads` threads for the CPU. With [`BackendKind::Auto`] the second value says why it is not a GPU.
+    /// The back end that is asked for. With [`BackendKind::Auto`] the second value says why it is not a GPU.
     ///
     /// # Errors
     /// Where it is not there or does not work.
-    pub fn new(
-        kind: BackendKind,
-        adapter: Option<&str>,
-        threads: usize,
-    ) -> Result<(Self, Option<GpuError>), BackendError> {
+    pub fn new(wanted: &BackendOptions) -> Result<(Self, Option<GpuError>), BackendError> {
         let gpu = || {
-            let options = gpu::Options { adapter: adapter.map(str::to_owned), ..gpu::Options::default() };
+            let (adapter, deterministic) = (wanted.adapter.clone(), wanted.deterministic);
+            let options = gpu::Options { adapter, deterministic, ..gpu::Options::default() };
             gpu::Engine::new(&options).map(|engine| Self::Gpu(Box::new(engine)))
         };
-        let cpu = || Engine::new(threads).map(Self::from);
-        Ok(match kind {
+        let cpu = || Engine::new(wanted.threads).map(Self::from);
+        Ok(match wanted.kind {
             BackendKind::Cpu => (cpu()?, None),
             BackendKind::Gpu => (gpu()?, None),
             // A driver takes a while to load, even to find that there is nothing to drive.
-            BackendKind::Auto if adapter.is_none() && !gpu::may_exist() => (cpu()?, Some(GpuError::NoAdapter)),
+            BackendKind::Auto if wanted.adapter.is_none() && !gpu::may_exist() => (cpu()?, Some(GpuError::NoAdapter)),
             BackendKind::Auto => match gpu() {
                 Ok(gpu) => (gpu, None),
                 // Who names an adapter wants that one.
@@ -181,6 +194,7 @@ pub struct Training {
     backend: Backend,
     gaussians: Gaussians,
     optimiser: Optimiser,
+    statistics: ScreenStatistics,
     newest: Newest,
     finished: Vec<LossTerms>,
 }
@@ -192,6 +206,7 @@ impl Training {
             backend: backend.into(),
             gaussians: Gaussians::new(),
             optimiser: Optimiser::new(),
+            statistics: ScreenStatistics::new(),
             newest: Newest::Host,
             finished: Vec::new(),
         }
@@ -222,14 +237,29 @@ impl Training {
         &self.optimiser
     }
 
+    /// What densification wants to know, of the last [`Training::sync`].
+    pub fn statistics(&self) -> &ScreenStatistics {
+        &self.statistics
+    }
+
     /// The model alone, as of the last [`Training::sync`].
     pub fn into_model(self) -> Gaussians {
         self.gaussians
     }
 
-    /// Replaces everything.
+    /// Model, optimiser and statistics alone, as of the last [`Training::sync`].
+    pub fn into_parts(self) -> (Gaussians, Optimiser, ScreenStatistics) {
+        (self.gaussians, self.optimiser, self.statistics)
+    }
+
+    /// Replaces everything; nothing was seen yet.
     pub fn restore(&mut self, gaussians: Gaussians, optimiser: Optimiser) {
-        (self.gaussians, self.optimiser) = (gaussians, optimiser);
+        self.restore_observed(gaussians, optimiser, ScreenStatistics::new());
+    }
+
+    /// Replaces everything.
+    pub fn restore_observed(&mut self, gaussians: Gaussians, optimiser: Optimiser, statistics: ScreenStatistics) {
+        (self.gaussians, self.optimiser, self.statistics) = (gaussians, optimiser, statistics);
         self.newest = Newest::Host;
         self.finished.clear();
     }
@@ -240,7 +270,7 @@ impl Training {
     /// Where the GPU fails: then the newest state is lost, and what is here is older.
     pub fn sync(&mut self) -> Result<(), BackendError> {
         if let (Newest::Gpu, Backend::Gpu(engine)) = (self.newest, &mut self.backend) {
-            engine.download(&mut self.gaussians, &mut self.optimiser)?;
+            engine.download(&mut self.gaussians, &mut self.optimiser, &mut self.statistics)?;
             self.finished.extend(engine.finished()?);
             self.newest = Newest::Both;
         }
@@ -257,6 +287,18 @@ impl Training {
         Ok((&mut self.gaussians, &mut self.optimiser))
     }
 
+    /// Model, optimiser and statistics, to change all alike.
+    ///
+    /// # Errors
+    /// As [`Training::sync`].
+    pub fn lists_mut(&mut self) -> Result<(&mut Gaussians, &mut Optimiser, &mut ScreenStatistics), BackendError> {
+        self.sync()?;
+        self.newest = Newest::Host;
+        self.optimiser.fit(&self.gaussians);
+        self.statistics.fit(&self.gaussians);
+        Ok((&mut self.gaussians, &mut self.optimiser, &mut self.statistics))
+    }
+
     /// Asks for one step of Adam on one view.
     ///
     /// # Errors
@@ -266,16 +308,50 @@ impl Training {
             Backend::Cpu(engine) => {
                 let terms = engine.train_step(&mut self.gaussians, &mut self.optimiser, view, settings);
                 self.finished.push(terms);
+                Ok(())
             }
+            Backend::Gpu(_) => Ok(self.on_gpu()?.step(view, settings)?),
+        }
+    }
+
+    /// The same step, which also adds what it saw of each Gaussian to the statistics, for densification.
+    ///
+    /// # Errors
+    /// Where the GPU fails.
+    pub fn step_observed(&mut self, view: &TrainingView, settings: &TrainingSettings) -> Result<(), BackendError> {
+        match &mut self.backend {
+            Backend::Cpu(engine) => {
+                let (model, optimiser, seen) = (&mut self.gaussians, &mut self.optimiser, &mut self.statistics);
+                self.finished.push(engine.train_step_observed(model, optimiser, view, settings, seen));
+                Ok(())
+            }
+            Backend::Gpu(_) => Ok(self.on_gpu()?.step_observed(view, settings)?),
+        }
+    }
+
+    /// Moves the means by noise, after the step that was asked for last.
+    pub(crate) fn add_noise(&mut self, noise: &Noise) -> Result<(), BackendError> {
+        match &mut self.backend {
+            Backend::Cpu(engine) => noise.add_to(&mut self.gaussians, engine.isa, &engine.workers),
             Backend::Gpu(engine) => {
-                if self.newest == Newest::Host {
-                    engine.upload(&self.gaussians, &mut self.optimiser)?;
+                if !(self.newest == Newest::Gpu && engine.add_noise(noise)) {
+                    self.sync()?;
+                    noise.add_to(&mut self.gaussians, Isa::detect(), &Workers::sequential());
+                    self.newest = Newest::Host;
                 }
-                self.newest = Newest::Gpu;
-                engine.step(view, settings)?;
             }
         }
         Ok(())
+    }
+
+    /// The GPU's engine with the newest model on it, which will be newer there.
+    fn on_gpu(&mut self) -> Result<&mut gpu::Engine, BackendError> {
+        let Backend::Gpu(engine) = &mut self.backend else { return Err(GpuError::NoAdapter.into()) };
+        if self.newest == Newest::Host {
+            engine.upload(&self.gaussians, &mut self.optimiser, &mut self.statistics)?;
+        }
+        self.newest = Newest::Gpu;
+        Ok(engine)
     }
 
     /// Losses of steps that are done and were not given before, in the order of the steps. Does not wait.

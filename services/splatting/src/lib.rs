@@ -43,7 +43,7 @@ mod training;
 mod view;
 mod workers;
 
-pub use backend::{Backend, BackendError, BackendKind, Training};
+pub use backend::{Backend, BackendError, BackendKind, BackendOptions, Training};
 pub use camera::{Camera, Pose, RenderSettings};
 pub use densify::{
     DefaultSettings, Densifier, DensifierState, DensifyError, DensifyReport, McmcSettings, Relocation, Strategy,

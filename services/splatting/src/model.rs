@@ -303,6 +303,11 @@ impl Gaussians {
         &self.blocks
     }
 
+    /// Ids of all Gaussians, in their order.
+    pub(crate) fn ids(&self) -> &[u64] {
+        &self.ids
+    }
+
     pub(crate) fn blocks_mut_and_ids(&mut self) -> (&mut [Block], &[u64]) {
         (&mut self.blocks, &self.ids)
     }

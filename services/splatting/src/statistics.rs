@@ -161,6 +161,10 @@ impl ScreenStatistics {
         Ok(Self { rows, length: gaussians })
     }
 
+    pub(crate) fn rows(&self) -> &[Lanes] {
+        &self.rows
+    }
+
     pub(crate) fn rows_mut(&mut self) -> &mut [Lanes] {
         &mut self.rows
     }

@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 use shared_types::config::TrainerConfig;
 use shared_types::config::trainer::BackendWord;
 use shared_types::folder::write_atomic;
-use splatting::{Backend, BackendError, BackendKind};
+use splatting::{Backend, BackendError, BackendKind, BackendOptions};
 
 const FILE: &str = "backend.json";
 /// A GPU that failed so often in a mission is not tried again.
@@ -64,8 +64,9 @@ pub fn choose(config: &TrainerConfig, model_folder: &Path, threads: usize) -> Re
         BackendWord::Cpu => BackendKind::Cpu,
         BackendWord::Gpu => BackendKind::Gpu,
     };
-    let adapter = Some(config.adapter.as_str()).filter(|name| !name.is_empty());
-    let (backend, why_not_gpu) = Backend::new(kind, adapter, threads)?;
+    let adapter = Some(config.adapter.clone()).filter(|name| !name.is_empty());
+    let wanted = BackendOptions { kind, adapter, deterministic: config.deterministic, threads };
+    let (backend, why_not_gpu) = Backend::new(&wanted)?;
     match why_not_gpu {
         Some(reason) => tracing::info!(%backend, %reason, "training"),
         None => tracing::info!(%backend, "training"),

@@ -64,9 +64,11 @@ pub struct TrainerConfig {
     pub iterations_per_s: DeclaredCost,
     /// Worker threads; 0: one per core.
     pub threads: u32,
-    /// What trains: `"auto"` (a GPU where there is a real one, else the CPU), `"cpu"` or `"gpu"`. Runs repeat bit for bit
-    /// on the CPU only.
+    /// What trains: `"auto"` (a GPU where there is a real one, else the CPU), `"cpu"` or `"gpu"`.
     pub backend: BackendWord,
+    /// Whether sums on a GPU have an order, so that training on the same adapter and driver repeats bit for bit; costs
+    /// memory and time. On the CPU it always does.
+    pub deterministic: bool,
     /// Name of the GPU, or a part of it (`vantage doctor` lists them); empty: the best that is not software.
     pub adapter: String,
     /// Iterations between two looks at stop, flattening and what is due.
@@ -153,6 +155,7 @@ impl Default for TrainerConfig {
             iterations_per_s: DeclaredCost::Fixed(80.0),
             threads: 0,
             backend: BackendWord::Auto,
+            deterministic: false,
             adapter: String::new(),
             slice_iterations: 20,
             checkpoint_period_s: 10.0,

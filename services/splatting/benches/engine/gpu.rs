@@ -5,7 +5,7 @@ use std::sync::atomic::AtomicBool;
 use std::time::Instant;
 
 use splatting::gpu::{Engine, Options as Adapter, adapters};
-use splatting::{Optimiser, RenderSettings};
+use splatting::{Optimiser, RenderSettings, ScreenStatistics};
 
 use crate::machine::Machine;
 use crate::report::{self, Row};
@@ -66,7 +66,7 @@ fn least(
 fn train(options: &Options, engine: &mut Engine, count: usize) -> Result<Row, Box<dyn std::error::Error>> {
     let mut cpu = splatting::Engine::new(1)?;
     let (model, view) = subject(&mut cpu, count)?;
-    engine.upload(&model, &mut Optimiser::new())?;
+    engine.upload(&model, &mut Optimiser::new(), &mut ScreenStatistics::new())?;
     let still = still();
     engine.step(&view, &still)?;
     engine.finish()?;

@@ -10,7 +10,7 @@ mod noise;
 
 use thiserror::Error;
 
-use crate::engine::Engine;
+use crate::backend::{BackendError, Training};
 use crate::model::{Gaussian, Gaussians};
 use crate::optimiser::Optimiser;
 use crate::random::Random;
@@ -19,7 +19,7 @@ use crate::statistics::ScreenStatistics;
 
 pub use adaptive::DefaultSettings;
 pub use mcmc::{McmcSettings, Relocation};
-use noise::Noise;
+pub(crate) use noise::Noise;
 
 /// How the number of Gaussians changes in training.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -54,8 +54,16 @@ impl Strategy {
         };
     }
 
-    /// Whether the strategy reads the statistics of the step of this iteration: where not,
-    /// [`Engine::train_step`] does.
+    /// Whether the list of Gaussians or their opacities change after the step of this iteration.
+    fn acts(&self, iteration: u32) -> bool {
+        match self {
+            Self::None => false,
+            Self::Default(settings) => settings.refines(iteration) || settings.resets(iteration),
+            Self::Mcmc(settings) => settings.refines(iteration),
+        }
+    }
+
+    /// Whether the strategy reads the statistics of the step of this iteration: where not, [`Training::step`] does.
     pub fn observes(&self, iteration: u32) -> bool {
         matches!(self, Self::Default(settings) if iteration < settings.refine_stop)
     }
@@ -217,17 +225,30 @@ impl Densifier {
     ///
     /// Where the list of Gaussians changes it is sorted along a Morton curve, optimiser and statistics with it. New
     /// Gaussians have new ids, the higher bands and the birth round of the one they come from, and no moments.
+    ///
+    /// # Errors
+    /// Where the GPU fails that trains.
     pub fn after_step(
         &mut self,
-        engine: &Engine,
         iteration: u32,
         settings: &TrainingSettings,
-        model: &mut Gaussians,
-        optimiser: &mut Optimiser,
-        statistics: &mut ScreenStatistics,
-    ) -> DensifyReport {
-        optimiser.fit(model);
-        statistics.fit(model);
+        training: &mut Training,
+    ) -> Result<DensifyReport, BackendError> {
+        let mut report = DensifyReport::default();
+        if self.strategy.acts(iteration) {
+            let (model, optimiser, statistics) = training.lists_mut()?;
+            report = self.act(iteration, (model, optimiser, statistics));
+        }
+        if let Strategy::Mcmc(strategy) = &self.strategy
+            && iteration < strategy.noise_stop
+        {
+            training.add_noise(&Noise::new(strategy, settings.lr_means, self.seed, iteration))?;
+        }
+        Ok(report)
+    }
+
+    /// Changes the list of Gaussians, or their opacities.
+    fn act(&mut self, iteration: u32, (model, optimiser, statistics): Parts<'_>) -> DensifyReport {
         let mut lists = Lists { model, optimiser, statistics, next_id: &mut self.next_id };
         let mut report = DensifyReport::default();
         match &self.strategy {
@@ -252,14 +273,12 @@ impl Densifier {
             let order = lists.model.morton_order();
             lists.permute(&order);
         }
-        if let Strategy::Mcmc(strategy) = &self.strategy
-            && iteration < strategy.noise_stop
-        {
-            engine.add_noise(model, &Noise::new(strategy, settings.lr_means, self.seed, iteration));
-        }
         report
     }
 }
+
+/// Model, optimiser and statistics.
+type Parts<'a> = (&'a mut Gaussians, &'a mut Optimiser, &'a mut ScreenStatistics);
 
 /// What holds one entry per Gaussian, changed together.
 struct Lists<'a> {

@@ -7,12 +7,11 @@
 #![expect(unsafe_code, reason = "tasks write disjoint parts of shared buffers")]
 
 use super::mcmc::McmcSettings;
-use crate::engine::Engine;
 use crate::model::{Block, Gaussians, LANES, ROW_LOG_SCALE, ROW_MEAN, ROW_OPACITY, ROW_ROTATION};
 use crate::projection::{VALUE_MAX, rotation_matrix};
 use crate::random::Random;
-use crate::simd::{Kernel, Simd, build, dispatch};
-use crate::workers::Shared;
+use crate::simd::{Isa, Kernel, Simd, build, dispatch};
+use crate::workers::{Shared, Workers};
 
 /// Blocks of 16 Gaussians that one task moves.
 const CHUNK_BLOCKS: usize = 64;
@@ -23,12 +22,13 @@ const NEGLIGIBLE: f32 = 1e-5;
 const EXPONENT_MAX: f32 = 80.0;
 
 /// Noise of one iteration.
+#[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct Noise {
     /// Learning rate times noise rate.
-    rate: f32,
-    opacity: f32,
-    sharpness: f32,
-    key: [u32; 2],
+    pub rate: f32,
+    pub opacity: f32,
+    pub sharpness: f32,
+    pub key: [u32; 2],
 }
 
 impl Noise {
@@ -44,18 +44,18 @@ impl Noise {
     }
 }
 
-impl Engine {
-    /// Moves the means by the noise.
-    pub(crate) fn add_noise(&self, model: &mut Gaussians, noise: &Noise) {
+impl Noise {
+    /// Moves the means.
+    pub(crate) fn add_to(&self, model: &mut Gaussians, isa: Isa, workers: &Workers) {
         let (blocks, ids) = model.blocks_mut_and_ids();
         let (count, total) = (blocks.len(), ids.len());
         let blocks = Shared::new(blocks);
-        self.workers.run(count.div_ceil(CHUNK_BLOCKS), |_, chunk| {
+        workers.run(count.div_ceil(CHUNK_BLOCKS), |_, chunk| {
             let range = chunk * CHUNK_BLOCKS..count.min((chunk + 1) * CHUNK_BLOCKS);
             let ids = &ids[range.start * LANES..total.min(range.end * LANES)];
             // SAFETY: the ranges of different chunks do not overlap.
             let blocks = unsafe { blocks.slice_mut(range) };
-            dispatch(self.isa, NoiseChunk { noise, blocks, ids });
+            dispatch(isa, NoiseChunk { noise: self, blocks, ids });
         });
     }
 }

@@ -11,6 +11,7 @@ use crate::engine::Rendered;
 use crate::model::{Gaussian, Gaussians};
 use crate::optimiser::Optimiser;
 use crate::settings::TrainingSettings;
+use crate::statistics::ScreenStatistics;
 use crate::view::TrainingView;
 
 const GAUSSIANS: usize = 5_000;
@@ -79,7 +80,7 @@ pub fn check(adapter: &str) -> Result<CheckReport, GpuError> {
         (dot, a2, b2) = (dot + a * b, a2 + a * a, b2 + b * b);
     }
 
-    gpu.upload(&model, &mut Optimiser::new())?;
+    gpu.upload(&model, &mut Optimiser::new(), &mut ScreenStatistics::new())?;
     let mut steps = |count: u32| -> Result<(), GpuError> {
         for _ in 0..count {
             gpu.step(&view, &settings)?;

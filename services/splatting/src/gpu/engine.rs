@@ -17,10 +17,12 @@ use super::model::{DeviceModel, blocks_of, lanes_of};
 use super::peak;
 use super::training::{Gradients, Keyframes, STAGES, Trainer};
 use crate::camera::{Camera, RenderSettings};
+use crate::densify::Noise;
 use crate::engine::{DEPTH_ALPHA_TINY, Moments, MomentsView, Rendered};
 use crate::model::{Gaussians, LANES, ROWS, SH_REST_MAX, sh_rest_coefficients, sh_rest_rows};
 use crate::optimiser::Optimiser;
 use crate::settings::{LossTerms, TrainingSettings};
+use crate::statistics::ScreenStatistics;
 use crate::training::Gradient;
 use crate::view::TrainingView;
 
@@ -242,11 +244,17 @@ impl Engine {
     ///
     /// # Errors
     /// Where it does not fit, or the GPU fails.
-    pub fn upload(&mut self, gaussians: &Gaussians, optimiser: &mut Optimiser) -> Result<(), GpuError> {
+    pub fn upload(
+        &mut self,
+        gaussians: &Gaussians,
+        optimiser: &mut Optimiser,
+        statistics: &mut ScreenStatistics,
+    ) -> Result<(), GpuError> {
         optimiser.fit(gaussians);
+        statistics.fit(gaussians);
         self.trainer = None;
         self.model = None;
-        self.model = Some(DeviceModel::upload(&self.context, gaussians, Some(optimiser))?);
+        self.model = Some(DeviceModel::upload(&self.context, gaussians, Some((optimiser, statistics)))?);
         Ok(())
     }
 
@@ -254,10 +262,15 @@ impl Engine {
     ///
     /// # Errors
     /// Where the GPU fails; what is given is then as it was.
-    pub fn download(&mut self, gaussians: &mut Gaussians, optimiser: &mut Optimiser) -> Result<(), GpuError> {
+    pub fn download(
+        &mut self,
+        gaussians: &mut Gaussians,
+        optimiser: &mut Optimiser,
+        statistics: &mut ScreenStatistics,
+    ) -> Result<(), GpuError> {
         self.finish()?;
         match &self.model {
-            Some(model) => model.download(&self.context, gaussians, optimiser),
+            Some(model) => model.download(&self.context, gaussians, (optimiser, statistics)),
             None => Ok(()),
         }
     }
@@ -268,11 +281,31 @@ impl Engine {
     /// # Errors
     /// Where the GPU fails. Nothing is known of the model then.
     pub fn step(&mut self, view: &TrainingView, settings: &TrainingSettings) -> Result<(), GpuError> {
+        self.step_of(view, settings, false)
+    }
+
+    /// The same step, which also adds what it saw of each Gaussian to the statistics, as
+    /// [`crate::Engine::train_step_observed`].
+    ///
+    /// # Errors
+    /// As [`Engine::step`].
+    pub fn step_observed(&mut self, view: &TrainingView, settings: &TrainingSettings) -> Result<(), GpuError> {
+        self.step_of(view, settings, true)
+    }
+
+    fn step_of(&mut self, view: &TrainingView, settings: &TrainingSettings, observed: bool) -> Result<(), GpuError> {
         self.ready(view)?;
         if let (Some(trainer), Some(model)) = (&mut self.trainer, &self.model) {
-            trainer.push(&self.context, &self.kernels, (model, &mut self.keyframes), view, settings)?;
+            let keyframes = (model, &mut self.keyframes);
+            trainer.push(&self.context, &self.kernels, keyframes, (view, observed), settings)?;
         }
         self.collect(false)
+    }
+
+    /// Moves the means by noise after the step that was asked for last. `false` where none is waiting: after
+    /// [`Engine::finish`].
+    pub(crate) fn add_noise(&mut self, noise: &Noise) -> bool {
+        self.trainer.as_mut().is_some_and(|trainer| trainer.add_noise(noise))
     }
 
     /// Losses that have arrived since the last call, in the order of the steps.
@@ -309,7 +342,7 @@ impl Engine {
         view: &TrainingView,
         settings: &TrainingSettings,
     ) -> Result<(LossTerms, Gradient), GpuError> {
-        self.upload(gaussians, &mut Optimiser::new())?;
+        self.upload(gaussians, &mut Optimiser::new(), &mut ScreenStatistics::new())?;
         let Gradients { terms, parameters, bands } = loop {
             self.ready(view)?;
             let (Some(trainer), Some(model)) = (&mut self.trainer, &self.model) else { continue };

@@ -78,6 +78,13 @@ pub(super) struct Job {
     pub log_scale_max: f32,
     pub ln_beta1: f32,
     pub ln_beta2: f32,
+    pub noise_rate: f32,
+    pub noise_opacity: f32,
+    pub noise_sharpness: f32,
+    pub unused: u32,
+    pub noise_key: [u32; 2],
+    /// The uniform's size is a multiple of 16 bytes.
+    pub padding: [u32; 2],
 }
 
 pub(super) const JOB_BYTES: u64 = size_of::<Job>() as u64;
@@ -115,6 +122,7 @@ mod unit_tests {
 
     #[test]
     fn jobs_and_views_fit_their_strides() {
-        assert_eq!((JOB_BYTES, VIEW_BYTES), (128, 128));
+        assert_eq!((JOB_BYTES, VIEW_BYTES), (160, 128));
+        const { assert!(JOB_BYTES <= STRIDE && VIEW_BYTES <= STRIDE) };
     }
 }

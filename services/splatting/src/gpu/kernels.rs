@@ -143,6 +143,18 @@ pub(super) const SOURCES: &[Source] = &[
         group1: &[],
     },
     Source {
+        name: "observe",
+        parts: &[JOB, PROJECTION, shader!("observe")],
+        group0: &[Job, Views, Read, Read, Read, Write],
+        group1: &[],
+    },
+    Source {
+        name: "noise",
+        parts: &[JOB, PROJECTION, shader!("noise")],
+        group0: &[Job, Write, Read, Read],
+        group1: &[],
+    },
+    Source {
         name: "adam",
         parts: &[JOB, PROJECTION, HARMONICS, PARAMETERS, shader!("adam")],
         group0: &[Job, Views, Write, Write, Write, Write, Write, Write, Write],
@@ -278,6 +290,8 @@ pub(super) struct Kernels {
     pub backward: Kernel,
     /// Where the backward pass is deterministic.
     pub gather: Option<Kernel>,
+    pub observe: Kernel,
+    pub noise: Kernel,
     pub adam: Kernel,
     pub gradient: Kernel,
     pub metrics: Kernel,
@@ -304,6 +318,8 @@ impl Kernels {
                 false => "backward_compare",
             })?,
             gather: if deterministic { Some(kernel("gather")?) } else { None },
+            observe: kernel("observe")?,
+            noise: kernel("noise")?,
             adam: kernel("adam")?,
             gradient: kernel("gradient")?,
             metrics: kernel("metrics")?,

@@ -13,6 +13,7 @@ mod check;
 mod context;
 mod engine;
 mod error;
+mod iteration;
 mod job;
 mod kernels;
 mod keyframe;

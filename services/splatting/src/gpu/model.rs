@@ -8,9 +8,11 @@ use super::context::Context;
 use super::error::GpuError;
 use crate::model::{Block, Gaussians, LANES, Lanes, ROWS, sh_rest_rows};
 use crate::optimiser::Optimiser;
+use crate::statistics::{self, ScreenStatistics};
 
 const LANES_BYTES: u64 = size_of::<Lanes>() as u64;
 const BLOCK_BYTES: u64 = size_of::<Block>() as u64;
+const STATISTICS_BYTES: u64 = statistics::ROWS as u64 * LANES_BYTES;
 
 /// Buffers of a model.
 pub(super) struct DeviceModel {
@@ -23,11 +25,14 @@ pub(super) struct DeviceModel {
     pub bytes: Bytes,
 }
 
-/// Adam's state: first moments of all blocks, then second moments.
+/// Adam's state: first moments of all blocks, then second moments. With what densification needs.
 pub(super) struct DeviceOptimiser {
     pub state: Buffer,
     pub band_state: Buffer,
     pub steps: Buffer,
+    /// As [`ScreenStatistics`] has them.
+    pub statistics: Buffer,
+    pub ids: Buffer,
 }
 
 fn rows_of(lanes: &[Lanes]) -> Vec<u8> {
@@ -49,8 +54,12 @@ pub(super) fn blocks_of(bytes: &[u8]) -> Vec<Block> {
 }
 
 impl DeviceModel {
-    /// Copies a model to the GPU; with an optimiser, which must have the model's shape, also its state.
-    pub fn upload(context: &Context, model: &Gaussians, optimiser: Option<&Optimiser>) -> Result<Self, GpuError> {
+    /// Copies a model to the GPU; for training with an optimiser and statistics, which must have the model's shape.
+    pub fn upload(
+        context: &Context,
+        model: &Gaussians,
+        training: Option<(&Optimiser, &ScreenStatistics)>,
+    ) -> Result<Self, GpuError> {
         let blocks = model.blocks().len() as u64;
         let rows = blocks * sh_rest_rows(model.sh_degree()) as u64;
         let mut bytes = Bytes::default();
@@ -61,11 +70,13 @@ impl DeviceModel {
         };
         let parameters = storage("parameters", BLOCK_BYTES * blocks)?;
         let bands = storage("parameters", LANES_BYTES * rows)?;
-        let state = match optimiser {
+        let state = match training {
             Some(_) => Some(DeviceOptimiser {
                 state: storage("optimiser", 2 * BLOCK_BYTES * blocks)?,
                 band_state: storage("optimiser", 2 * LANES_BYTES * rows)?,
                 steps: storage("optimiser", 4 * model.len() as u64)?,
+                statistics: storage("densification", STATISTICS_BYTES * blocks)?,
+                ids: storage("densification", 8 * model.len() as u64)?,
             }),
             None => None,
         };
@@ -77,12 +88,14 @@ impl DeviceModel {
         };
         write(&parameters, 0, &rows_of_blocks(model.blocks()));
         write(&bands, 0, &rows_of(model.rest()));
-        if let (Some(device), Some(host)) = (&state, optimiser) {
+        if let (Some(device), Some((host, statistics))) = (&state, training) {
             write(&device.state, 0, &rows_of_blocks(&host.first));
             write(&device.state, BLOCK_BYTES * blocks, &rows_of_blocks(&host.second));
             write(&device.band_state, 0, &rows_of(&host.first_rest));
             write(&device.band_state, LANES_BYTES * rows, &rows_of(&host.second_rest));
             write(&device.steps, 0, cast_slice(&host.steps));
+            write(&device.statistics, 0, &rows_of(statistics.rows()));
+            write(&device.ids, 0, cast_slice(model.ids()));
         }
         // So that the copies do not wait in memory for the first iteration.
         context.queue.submit([]);
@@ -96,18 +109,19 @@ impl DeviceModel {
         &self,
         context: &Context,
         model: &mut Gaussians,
-        optimiser: &mut Optimiser,
+        (optimiser, statistics): (&mut Optimiser, &mut ScreenStatistics),
     ) -> Result<(), GpuError> {
         let Some(device) = &self.optimiser else { return Ok(()) };
         let blocks = model.blocks().len();
         let rows = blocks * sh_rest_rows(self.sh_degree);
         let (block_bytes, row_bytes) = (BLOCK_BYTES * blocks as u64, LANES_BYTES * rows as u64);
-        let [parameters, bands, state, band_state, steps] = context.read([
+        let [parameters, bands, state, band_state, steps, seen] = context.read([
             (&self.parameters, block_bytes),
             (&self.bands, row_bytes),
             (&device.state, 2 * block_bytes),
             (&device.band_state, 2 * row_bytes),
             (&device.steps, 4 * u64::from(self.gaussians)),
+            (&device.statistics, STATISTICS_BYTES * blocks as u64),
         ])?;
         let (model_blocks, model_rest) = model.parts_mut();
         model_blocks.copy_from_slice(&blocks_of(&parameters));
@@ -118,6 +132,8 @@ impl DeviceModel {
         (optimiser.first_rest, optimiser.second_rest) = (lanes_of(first), lanes_of(second));
         optimiser.sh_degree = self.sh_degree;
         optimiser.steps = pod_collect_to_vec(&steps);
+        statistics.fit(model);
+        statistics.rows_mut().copy_from_slice(&lanes_of(&seen));
         Ok(())
     }
 }

@@ -9,10 +9,12 @@ use super::buffers::Bytes;
 use super::chain::{Chain, Listing, Size, dispatch};
 use super::context::{Context, Mapping, copy};
 use super::error::GpuError;
-use super::job::{Job, STRIDE, View, fold};
-use super::kernels::{Kernel, Kernels};
+use super::iteration::{Counts, Iteration, job};
+use super::job::{STRIDE, fold};
+use super::kernels::Kernels;
 use super::keyframe::DeviceKeyframe;
 use super::model::DeviceModel;
+use crate::densify::Noise;
 use crate::settings::{LossTerms, TrainingSettings};
 use crate::view::TrainingView;
 
@@ -25,42 +27,6 @@ const RING_WORDS: usize = 12;
 /// Most bytes that keyframes take; the one not used for longest goes first.
 const KEYFRAMES_MAX: u64 = 512 << 20;
 
-/// What of a keyframe turns sums into means.
-#[derive(Clone, Copy)]
-struct Counts {
-    samples: f64,
-    foreground: usize,
-    free: usize,
-    with_depth: usize,
-}
-
-impl Counts {
-    fn new(view: &TrainingView) -> Self {
-        let samples = 3.0 * view.camera().pixels() as f64;
-        Self { samples, foreground: view.foreground, free: view.free, with_depth: view.with_depth }
-    }
-}
-
-/// An iteration that was asked for.
-#[derive(Clone, Copy)]
-struct Iteration {
-    keyframe: u64,
-    counts: Counts,
-    view: View,
-    settings: TrainingSettings,
-}
-
-impl Iteration {
-    fn new(view: &TrainingView, settings: &TrainingSettings) -> Self {
-        Self {
-            keyframe: view.id(),
-            counts: Counts::new(view),
-            view: View::new(view.camera(), &settings.render, 0.0),
-            settings: *settings,
-        }
-    }
-}
-
 /// A stage of an iteration, as the CPU engine names them.
 #[derive(Clone, Copy)]
 enum Stage {
@@ -70,6 +36,15 @@ enum Stage {
     Backward,
     /// With the sum of the terms.
     Adam,
+}
+
+/// What takes the gradients of an iteration.
+#[derive(Clone, Copy)]
+enum Last<'a> {
+    /// A step, and what belongs to it.
+    Step(&'a Iteration),
+    /// The buffers of the caller; nothing moves.
+    Gradient(&'a BindGroup),
 }
 
 /// Number of stages: those of [`crate::Engine::stage_times`].
@@ -114,7 +89,9 @@ pub(super) struct Trainer {
     loss: BindGroup,
     backward: BindGroup,
     gather: Option<BindGroup>,
+    observe: BindGroup,
     adam: BindGroup,
+    noise: BindGroup,
     metrics: BindGroup,
     pub bytes: Bytes,
     waiting: Vec<Iteration>,
@@ -212,6 +189,10 @@ impl Trainer {
             let buffers = [jobs_ref, &chain.rows, &chain.boxes, starts, entries, reached, partials, &gradients];
             kernel.bind(context, 0, &buffers)
         });
+        let seen = [&model.parameters, &gradients, &chain.control, &optimiser.statistics];
+        let observe = kernels.observe.bind(context, 1, &[jobs_ref, views_ref, seen[0], seen[1], seen[2], seen[3]]);
+        let moved = [jobs_ref, &model.parameters, &optimiser.ids, &chain.control];
+        let noise = kernels.noise.bind(context, 0, &moved);
         let adam = kernels.adam.bind(
             context,
             1,
@@ -240,7 +221,9 @@ impl Trainer {
             loss,
             backward,
             gather,
+            observe,
             adam,
+            noise,
             metrics,
             bytes,
             waiting: Vec::new(),
@@ -271,22 +254,33 @@ impl Trainer {
         self.recorded = other.recorded;
     }
 
-    /// Asks for an iteration; submits once enough are waiting.
+    /// Asks for an iteration; submits once more than enough are waiting. The last one waits for what may follow it.
     pub fn push(
         &mut self,
         context: &Context,
         kernels: &Kernels,
         (model, keyframes): (&DeviceModel, &mut Keyframes),
-        view: &TrainingView,
+        (view, observed): (&TrainingView, bool),
         settings: &TrainingSettings,
     ) -> Result<(), GpuError> {
         self.recorded += 1;
         keyframes.hold(context, kernels, view, self.recorded)?;
-        self.waiting.push(Iteration::new(view, settings));
-        if self.waiting.len() >= ITERATIONS {
-            self.submit(context, kernels, model, keyframes)?;
+        self.waiting.push(Iteration::new(view, settings, observed));
+        if self.waiting.len() > ITERATIONS {
+            self.submit_batch(context, kernels, model, keyframes);
         }
-        Ok(())
+        context.check()
+    }
+
+    /// Asks for noise after the iteration that was asked for last; `false` where that one is over.
+    pub fn add_noise(&mut self, noise: &Noise) -> bool {
+        match self.waiting.last_mut() {
+            Some(last) => {
+                last.noise = Some(*noise);
+                true
+            }
+            None => false,
+        }
     }
 
     /// Submits what is waiting.
@@ -298,30 +292,34 @@ impl Trainer {
         keyframes: &Keyframes,
     ) -> Result<(), GpuError> {
         while !self.waiting.is_empty() {
-            let rest = self.waiting.split_off(self.waiting.len().min(ITERATIONS));
-            let iterations = std::mem::replace(&mut self.waiting, rest);
-            for (slot, iteration) in iterations.iter().enumerate() {
-                let job = job(self.chain.size, model, slot as u32, iteration);
-                context.queue.write_buffer(&self.jobs, STRIDE * slot as u64, bytes_of(&job));
-                context.queue.write_buffer(&self.views, STRIDE * slot as u64, bytes_of(&iteration.view));
-            }
-            let mut encoder = context.encoder();
-            let mut pass = encoder.begin_compute_pass(&ComputePassDescriptor::default());
-            for (slot, iteration) in iterations.iter().enumerate() {
-                let offset = (STRIDE * slot as u64) as u32;
-                if let Some(keyframe) = keyframes.held.get(&iteration.keyframe) {
-                    self.record(&mut pass, kernels, keyframe, &[offset, offset], (&kernels.adam, &self.adam));
-                }
-            }
-            drop(pass);
-            let bytes = self.ring.size();
-            let staging = self.idle.pop().unwrap_or_else(|| context.staging(bytes));
-            encoder.copy_buffer_to_buffer(&self.ring, 0, &staging, 0, bytes);
-            context.queue.submit([encoder.finish()]);
-            let mapping = Mapping::begin(&staging);
-            self.flights.push_back(Flight { iterations, staging, mapping });
+            self.submit_batch(context, kernels, model, keyframes);
         }
         context.check()
+    }
+
+    fn submit_batch(&mut self, context: &Context, kernels: &Kernels, model: &DeviceModel, keyframes: &Keyframes) {
+        let rest = self.waiting.split_off(self.waiting.len().min(ITERATIONS));
+        let iterations = std::mem::replace(&mut self.waiting, rest);
+        for (slot, iteration) in iterations.iter().enumerate() {
+            let job = job(self.chain.size, model, slot as u32, iteration);
+            context.queue.write_buffer(&self.jobs, STRIDE * slot as u64, bytes_of(&job));
+            context.queue.write_buffer(&self.views, STRIDE * slot as u64, bytes_of(&iteration.view));
+        }
+        let mut encoder = context.encoder();
+        let mut pass = encoder.begin_compute_pass(&ComputePassDescriptor::default());
+        for (slot, iteration) in iterations.iter().enumerate() {
+            let offset = (STRIDE * slot as u64) as u32;
+            if let Some(keyframe) = keyframes.held.get(&iteration.keyframe) {
+                self.record(&mut pass, kernels, keyframe, &[offset, offset], Last::Step(iteration));
+            }
+        }
+        drop(pass);
+        let bytes = self.ring.size();
+        let staging = self.idle.pop().unwrap_or_else(|| context.staging(bytes));
+        encoder.copy_buffer_to_buffer(&self.ring, 0, &staging, 0, bytes);
+        context.queue.submit([encoder.finish()]);
+        let mapping = Mapping::begin(&staging);
+        self.flights.push_back(Flight { iterations, staging, mapping });
     }
 
     /// Records the dispatches of one iteration, of which `last` takes the gradients.
@@ -331,7 +329,7 @@ impl Trainer {
         kernels: &Kernels,
         keyframe: &DeviceKeyframe,
         offsets: &[u32; 2],
-        last: (&Kernel, &BindGroup),
+        last: Last<'_>,
     ) {
         for stage in Stage::ALL {
             self.record_stage(stage, pass, kernels, keyframe, offsets, last);
@@ -345,7 +343,7 @@ impl Trainer {
         kernels: &Kernels,
         keyframe: &DeviceKeyframe,
         offsets: &[u32; 2],
-        (last, group): (&Kernel, &BindGroup),
+        last: Last<'_>,
     ) {
         let size = self.chain.size;
         let tiles = (size.tiles_x(), size.tiles_y(), 1);
@@ -368,7 +366,19 @@ impl Trainer {
             }
             Stage::Adam => {
                 let (x, y) = fold(size.parameter_groups());
-                dispatch(pass, last, group, offsets, (x, y, 1));
+                let mut each = |kernel, group| dispatch(pass, kernel, group, offsets, (x, y, 1));
+                match last {
+                    Last::Step(iteration) => {
+                        if iteration.observed {
+                            each(&kernels.observe, &self.observe);
+                        }
+                        each(&kernels.adam, &self.adam);
+                        if iteration.noise.is_some() {
+                            each(&kernels.noise, &self.noise);
+                        }
+                    }
+                    Last::Gradient(group) => each(&kernels.gradient, group),
+                }
                 dispatch(pass, &kernels.metrics, &self.metrics, offsets, (1, 1, 1));
             }
         }
@@ -387,7 +397,7 @@ impl Trainer {
         const STAMPS: u32 = 2 * STAGES as u32;
         keyframes.hold(context, kernels, view, self.recorded)?;
         let Some(keyframe) = keyframes.held.get(&view.id()) else { return Ok([f64::NAN; STAGES]) };
-        let iteration = Iteration::new(view, settings);
+        let iteration = Iteration::new(view, settings, false);
         context.queue.write_buffer(&self.jobs, 0, bytes_of(&job(self.chain.size, model, 0, &iteration)));
         context.queue.write_buffer(&self.views, 0, bytes_of(&iteration.view));
         let stamps = context.device.create_query_set(&wgpu::QuerySetDescriptor {
@@ -405,7 +415,7 @@ impl Trainer {
                 end_of_pass_write_index: Some(2 * at + 1),
             });
             let mut pass = encoder.begin_compute_pass(&ComputePassDescriptor { label: None, timestamp_writes });
-            self.record_stage(stage, &mut pass, kernels, keyframe, &[0, 0], (&kernels.adam, &self.adam));
+            self.record_stage(stage, &mut pass, kernels, keyframe, &[0, 0], Last::Step(&iteration));
         }
         encoder.resolve_query_set(&stamps, 0..STAMPS, &resolved, 0);
         context.queue.submit([encoder.finish()]);
@@ -509,7 +519,7 @@ impl Trainer {
         settings: &TrainingSettings,
     ) -> Result<Result<Gradients, u32>, GpuError> {
         keyframes.hold(context, kernels, view, self.recorded)?;
-        let iteration = Iteration::new(view, settings);
+        let iteration = Iteration::new(view, settings, false);
         let out = context.storage("gradients", model.parameters.size())?;
         let bands_out = context.storage("gradients", model.bands.size())?;
         let group = kernels.gradient.bind(
@@ -531,7 +541,7 @@ impl Trainer {
         let mut encoder = context.encoder();
         let mut pass = encoder.begin_compute_pass(&ComputePassDescriptor::default());
         if let Some(keyframe) = keyframes.held.get(&iteration.keyframe) {
-            self.record(&mut pass, kernels, keyframe, &[0, 0], (&kernels.gradient, &group));
+            self.record(&mut pass, kernels, keyframe, &[0, 0], Last::Gradient(&group));
         }
         drop(pass);
         context.queue.submit([encoder.finish()]);
@@ -542,42 +552,5 @@ impl Trainer {
             0 => Err(words[9]),
             _ => Ok(Gradients { terms: self.terms(&words, &iteration), parameters, bands }),
         })
-    }
-}
-
-/// What the kernels are told of an iteration.
-fn job(size: Size, model: &DeviceModel, slot: u32, iteration: &Iteration) -> Job {
-    let settings = &iteration.settings;
-    let counts = &iteration.counts;
-    let per = |weight: f32, count: usize| if count == 0 { 0.0 } else { weight / count as f32 };
-    let (gaussians, deviations) = (size.gaussians.max(1) as f32, 3.0 * size.gaussians.max(1) as f32);
-    let degree = model.sh_degree.min(settings.render.sh_degree);
-    let limit = |sigma: f32| sigma.max(1e-9).ln();
-    let (low, high) = settings.sigma_limits_m.map_or((-20.0, 10.0), |(low, high)| (limit(low), limit(high)));
-    Job {
-        bands: crate::model::sh_rest_coefficients(degree) as u32,
-        band_rows: crate::model::sh_rest_rows(model.sh_degree) as u32,
-        slot,
-        l1: settings.l1_weight / counts.samples as f32,
-        ssim: settings.ssim_weight / counts.samples as f32,
-        depth: per(settings.depth_weight, counts.with_depth),
-        free: per(settings.free_weight, counts.free),
-        isotropic: settings.isotropic_weight / deviations,
-        opacity: settings.opacity_weight / gaussians,
-        scale: settings.scale_weight / deviations,
-        lr_bands: settings.lr_sh_rest,
-        lr_means: settings.lr_means,
-        lr_log_scales: settings.lr_log_scales,
-        lr_rotations: settings.lr_rotations,
-        lr_opacity: settings.lr_opacity,
-        lr_sh: settings.lr_sh,
-        beta1: settings.betas.0,
-        beta2: settings.betas.1,
-        epsilon: settings.epsilon,
-        log_scale_min: low,
-        log_scale_max: high,
-        ln_beta1: f64::from(settings.betas.0).ln() as f32,
-        ln_beta2: f64::from(settings.betas.1).ln() as f32,
-        ..size.job()
     }
 }

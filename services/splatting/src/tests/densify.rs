@@ -7,7 +7,7 @@ use glam::Vec3;
 use super::{Random, random_view, scene};
 use crate::{
     DefaultSettings, Densifier, DensifierState, DensifyError, DensifyReport, Engine, Gaussian, Gaussians, McmcSettings,
-    Optimiser, SH_REST_MAX, ScreenStatistics, Strategy, TrainingSettings,
+    Optimiser, SH_REST_MAX, ScreenStatistics, Strategy, Training, TrainingSettings,
 };
 
 pub(super) const EXTENT_M: f32 = 2.0;
@@ -53,9 +53,13 @@ pub(super) fn after_step(
     iteration: u32,
     state: &mut (Gaussians, Optimiser, ScreenStatistics),
 ) -> DensifyReport {
-    let engine = Engine::new(1).unwrap();
-    let (model, optimiser, statistics) = (&mut state.0, &mut state.1, &mut state.2);
-    let report = densifier.after_step(&engine, iteration, &TrainingSettings::default(), model, optimiser, statistics);
+    let mut training = Training::new(Engine::new(1).unwrap());
+    let (model, optimiser, statistics) = std::mem::take(state);
+    training.restore_observed(model, optimiser, statistics);
+    let report = densifier.after_step(iteration, &TrainingSettings::default(), &mut training).unwrap();
+    training.lists_mut().unwrap();
+    *state = training.into_parts();
+    let (model, optimiser, statistics) = (&state.0, &state.1, &state.2);
     assert_eq!((model.len(), model.len()), (optimiser.len(), statistics.len()));
     let ids: HashSet<u64> = model.iter().map(|g| g.id).collect();
     assert_eq!(ids.len(), model.len(), "ids are unique");

@@ -5,8 +5,8 @@ use glam::{Quat, Vec3};
 use super::Random;
 use crate::{
     Camera, ColoredPoint, DefaultSettings, Densifier, DensifierState, Engine, Gaussian, Gaussians, InitialGaussians,
-    McmcSettings, Optimiser, Pose, RenderSettings, Rendered, Schedule, ScreenStatistics, Strategy, TrainingSettings,
-    TrainingView, metrics, scene_extent,
+    McmcSettings, Optimiser, Pose, RenderSettings, Rendered, Schedule, ScreenStatistics, Strategy, Training,
+    TrainingSettings, TrainingView, metrics, scene_extent,
 };
 
 /// A bumpy sphere of about 0.5 m with fine stripes, as Gaussians lying on its surface.
@@ -92,27 +92,30 @@ fn train(
     let schedule = Schedule { sh_degree: 0, ..Schedule::published(scene.extent_m) }.scaled(factor);
     let initial =
         if matches!(strategy, Strategy::Mcmc(_)) { InitialGaussians::MCMC } else { InitialGaussians::PUBLISHED };
-    let mut model = initial.from_points(&scene.points).unwrap();
+    let model = initial.from_points(&scene.points).unwrap();
     let mut densifier = Densifier::new(strategy, scene.extent_m, 5, &model).unwrap();
-    let (mut optimiser, mut statistics) = (Optimiser::new(), ScreenStatistics::new());
-    let mut engine = Engine::new(threads).unwrap();
+    let mut training = Training::new(Engine::new(threads).unwrap());
+    training.restore(model, Optimiser::new());
     let mut settings = TrainingSettings { depth_weight: 0.0, free_weight: 0.0, ..TrainingSettings::default() };
     strategy.apply(&mut settings);
     for iteration in 0..iterations {
         if Some(iteration) == interruption {
             let state = DensifierState::from_bytes(&densifier.state().to_bytes());
             densifier = Densifier::resume(strategy, scene.extent_m, state).unwrap();
-            statistics = ScreenStatistics::decode(&statistics.encode(), model.len()).unwrap();
+            let (_, _, statistics) = training.lists_mut().unwrap();
+            *statistics = ScreenStatistics::decode(&statistics.encode(), statistics.len()).unwrap();
         }
         schedule.apply(iteration, &mut settings);
         let view = &scene.views[(iteration as usize * 7) % scene.views.len()];
         if densifier.observes(iteration) {
-            engine.train_step_observed(&mut model, &mut optimiser, view, &settings, &mut statistics);
+            training.step_observed(view, &settings).unwrap();
         } else {
-            engine.train_step(&mut model, &mut optimiser, view, &settings);
+            training.step(view, &settings).unwrap();
         }
-        densifier.after_step(&engine, iteration, &settings, &mut model, &mut optimiser, &mut statistics);
+        densifier.after_step(iteration, &settings, &mut training).unwrap();
     }
+    let mut engine = Engine::new(threads).unwrap();
+    let model = training.into_model();
     assert!(model.is_finite());
     let mut image = Rendered::default();
     let sum: f64 = scene

@@ -8,7 +8,7 @@ use super::densify::{EXTENT_M, after_step, by_id, trained};
 use super::{isas, scene};
 use crate::{
     DefaultSettings, Densifier, DensifyReport, Engine, Gaussian, Gaussians, Isa, McmcSettings, Optimiser, Relocation,
-    RenderSettings, Rendered, ScreenStatistics, Strategy, TrainingSettings, metrics,
+    RenderSettings, Rendered, ScreenStatistics, Strategy, Training, TrainingSettings, metrics,
 };
 
 /// The published double sum for the scales, term by term.
@@ -161,11 +161,11 @@ fn where_nothing_lives_nothing_is_moved() {
 fn noisy(model: &Gaussians, isa: Isa, threads: usize, (seed, iteration): (u64, u32)) -> Gaussians {
     let strategy = McmcSettings { refine_start: u32::MAX - 1, ..McmcSettings::default() };
     let mut densifier = Densifier::new(Strategy::Mcmc(strategy), EXTENT_M, seed, model).unwrap();
-    let (mut moved, mut optimiser, mut statistics) = (model.clone(), Optimiser::new(), ScreenStatistics::new());
-    let engine = Engine::with_isa(threads, isa).unwrap();
+    let mut training = Training::new(Engine::with_isa(threads, isa).unwrap());
+    training.restore(model.clone(), Optimiser::new());
     let settings = TrainingSettings { lr_means: 2e-4, ..TrainingSettings::default() };
-    densifier.after_step(&engine, iteration, &settings, &mut moved, &mut optimiser, &mut statistics);
-    moved
+    densifier.after_step(iteration, &settings, &mut training).unwrap();
+    training.into_model()
 }
 
 /// Displacements have mean 0 and the covariance (rate gate Σ)², and an opaque Gaussian stays.

@@ -3,7 +3,7 @@
 use crate::common::*;
 use shared_types::config::{Config, TrainerConfig};
 use shared_types::folder::MissionFolder;
-use splatting::{Backend, BackendKind};
+use splatting::{Backend, BackendKind, BackendOptions};
 use trainer::checkpoint;
 use trainer::keyframes::KeyframeError;
 use trainer::session::{Session, SessionError};
@@ -138,8 +138,9 @@ fn a_round_changes_its_back_end_by_a_checkpoint() {
         println!("a_round_changes_its_back_end_by_a_checkpoint: skipped, no GPU adapter");
         return;
     };
-    let gpu = || Backend::new(BackendKind::Gpu, Some(&adapter.name), 1).unwrap().0;
-    let cpu = || Backend::new(BackendKind::Cpu, None, 1).unwrap().0;
+    let options = |kind| BackendOptions { kind, adapter: Some(adapter.name.clone()), threads: 1, deterministic: false };
+    let gpu = || Backend::new(&options(BackendKind::Gpu)).unwrap().0;
+    let cpu = || Backend::new(&options(BackendKind::Cpu)).unwrap().0;
     let mut source = Memory::new((48, 36));
     let model = shared_types::config::ModelConfig { width: 48, height: 36, ..model_config() };
     let mut bytes = None;

@@ -59,6 +59,12 @@ struct Job {
     /// Natural logarithms of the betas, from double precision.
     ln_beta1: f32,
     ln_beta2: f32,
+    /// Noise on the means: learning rate times noise rate, the opacity and the sharpness of its gate, its key.
+    noise_rate: f32,
+    noise_opacity: f32,
+    noise_sharpness: f32,
+    unused: u32,
+    noise_key: vec2u,
 }
 
 const TILE: u32 = 16u;

@@ -8,7 +8,9 @@ use super::super::{GpuError, Options};
 use super::{options, skipped, with_engine};
 use crate::tests::forward::{assert_within, errors};
 use crate::tests::{camera, random_view};
-use crate::{Camera, Gaussian, Gaussians, Pose, RenderSettings, Rendered, TrainingSettings, reference};
+use crate::{
+    Camera, Gaussian, Gaussians, Pose, RenderSettings, Rendered, ScreenStatistics, TrainingSettings, reference,
+};
 
 mod naga_validation {
     /// Parses and validates a kernel without any adapter.
@@ -107,9 +109,9 @@ fn broken_gaussians_are_left_out_and_left_alone() {
         assert!(a == b);
         let mut optimiser = crate::Optimiser::new();
         let before: Vec<_> = broken.iter().collect();
-        engine.upload(&broken, &mut optimiser).unwrap();
+        engine.upload(&broken, &mut optimiser, &mut ScreenStatistics::new()).unwrap();
         engine.step(&random_view(camera, 1), &TrainingSettings::default()).unwrap();
-        engine.download(&mut broken, &mut optimiser).unwrap();
+        engine.download(&mut broken, &mut optimiser, &mut ScreenStatistics::new()).unwrap();
         assert!(engine.finished().unwrap()[0].total.is_finite());
         for i in 0..broken.len() {
             if i < 3 {

@@ -4,6 +4,7 @@
 //! `VANTAGE_TEST_ADAPTER` names another adapter than the first.
 
 mod check;
+mod densify;
 mod edges;
 mod forward;
 mod gradients;

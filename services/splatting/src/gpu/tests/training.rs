@@ -6,10 +6,12 @@ use super::super::{Engine, Options};
 use super::{options, skipped, with_engine};
 use crate::tests::harmonics::scene_of_degree;
 use crate::tests::{camera, random_view, scene};
-use crate::{Gaussians, LossTerms, Optimiser, Pose, RenderSettings, Rendered, TrainingSettings, TrainingView};
+use crate::{
+    Gaussians, LossTerms, Optimiser, Pose, RenderSettings, Rendered, ScreenStatistics, TrainingSettings, TrainingView,
+};
 
 /// Keyframes of a scene around it, and a disturbed copy to begin with.
-fn task(count: usize, size: (u32, u32), degree: u8) -> (Gaussians, Vec<TrainingView>) {
+pub(super) fn task(count: usize, size: (u32, u32), degree: u8) -> (Gaussians, Vec<TrainingView>) {
     let truth = scene_of_degree(count, 11, degree);
     let mut cpu = crate::Engine::new(1).unwrap();
     let views = (0..4)
@@ -36,7 +38,7 @@ fn task(count: usize, size: (u32, u32), degree: u8) -> (Gaussians, Vec<TrainingV
 }
 
 /// Slow enough that a hundred iterations do not converge: there, rounding decides about decibels.
-fn settings() -> TrainingSettings {
+pub(super) fn settings() -> TrainingSettings {
     TrainingSettings {
         lr_means: 3e-4,
         lr_log_scales: 2e-3,
@@ -62,18 +64,18 @@ fn on_gpu(
     iterations: usize,
 ) -> (Gaussians, Optimiser, Vec<LossTerms>) {
     let (mut model, mut optimiser) = (start.clone(), Optimiser::new());
-    engine.upload(&model, &mut optimiser).unwrap();
+    engine.upload(&model, &mut optimiser, &mut ScreenStatistics::new()).unwrap();
     let mut terms = Vec::new();
     for i in 0..iterations {
         engine.step(&views[i % views.len()], &settings()).unwrap();
         terms.extend(engine.finished().unwrap());
     }
-    engine.download(&mut model, &mut optimiser).unwrap();
+    engine.download(&mut model, &mut optimiser, &mut ScreenStatistics::new()).unwrap();
     terms.extend(engine.finished().unwrap());
     (model, optimiser, terms)
 }
 
-fn mean_psnr(model: &Gaussians, views: &[TrainingView]) -> f64 {
+pub(super) fn mean_psnr(model: &Gaussians, views: &[TrainingView]) -> f64 {
     let mut engine = crate::Engine::new(1).unwrap();
     let one = |view| engine.gradient(model, view, &settings()).0.foreground_psnr_db();
     views.iter().map(one).sum::<f64>() / views.len() as f64
@@ -129,8 +131,8 @@ fn what_goes_up_comes_down_bit_for_bit() {
         let (start, views) = task(77, (24, 24), 1);
         let (model, optimiser, _) = on_cpu(&start, &views, 5);
         let (mut back, mut state) = (model.clone(), optimiser.clone());
-        engine.upload(&model, &mut state).unwrap();
-        engine.download(&mut back, &mut state).unwrap();
+        engine.upload(&model, &mut state, &mut ScreenStatistics::new()).unwrap();
+        engine.download(&mut back, &mut state, &mut ScreenStatistics::new()).unwrap();
         assert!(back == model && state == optimiser);
     });
 }
@@ -184,13 +186,13 @@ fn a_lost_device_is_an_error_and_a_new_engine_goes_on() {
     let (start, views) = task(50, (24, 24), 0);
     let mut engine = Engine::new(&options).unwrap();
     let (mut model, mut optimiser) = (start.clone(), Optimiser::new());
-    engine.upload(&model, &mut optimiser).unwrap();
+    engine.upload(&model, &mut optimiser, &mut ScreenStatistics::new()).unwrap();
     engine.step(&views[0], &settings()).unwrap();
     engine.finish().unwrap();
     engine.lose_device();
     let failed = (0..64).find_map(|_| engine.step(&views[0], &settings()).err());
     assert!(failed.is_some_and(|error| !error.to_string().is_empty()));
-    assert!(engine.download(&mut model, &mut optimiser).is_err());
+    assert!(engine.download(&mut model, &mut optimiser, &mut ScreenStatistics::new()).is_err());
     assert!(model == start, "what the host has is as it was");
     assert!(engine.render(&model, views[0].camera(), &settings().render, &mut Rendered::default()).is_err());
     let mut fresh = Engine::new(&options).unwrap();
@@ -204,7 +206,7 @@ fn half_a_million_gaussians_and_48_keyframes_fit_420_mb() {
     let Some(options) = options() else { return skipped(test) };
     let mut engine = Engine::new(&options).unwrap();
     let model = scene(500_000, 1);
-    engine.upload(&model, &mut Optimiser::new()).unwrap();
+    engine.upload(&model, &mut Optimiser::new(), &mut ScreenStatistics::new()).unwrap();
     // Asked for and never run: what counts is what is allocated.
     engine.step(&random_view(camera(320, 240), 1), &settings()).unwrap();
     let mut all = 0;
@@ -221,7 +223,7 @@ fn half_a_million_gaussians_and_48_keyframes_fit_420_mb() {
 fn stages_are_timed_where_the_adapter_can() {
     with_engine("stages_are_timed_where_the_adapter_can", |engine| {
         let (start, views) = task(100, (32, 32), 0);
-        engine.upload(&start, &mut Optimiser::new()).unwrap();
+        engine.upload(&start, &mut Optimiser::new(), &mut ScreenStatistics::new()).unwrap();
         engine.step(&views[0], &settings()).unwrap();
         if let Some(times) = engine.profile(&views[0], &settings()).unwrap() {
             assert!(times.iter().all(|&t| (0.0..10.0).contains(&t)) && times.iter().sum::<f64>() > 0.0, "{times:?}");
