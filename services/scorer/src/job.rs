@@ -5,11 +5,10 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use glam::{DQuat, DVec3, Quat, Vec3};
 use shared_types::messages::{CandidateScore, CandidateView, GaussianRow, ScoreRequest, VarianceMode};
-use splatting::{Backend, BackendError, Camera, Gaussian, Gaussians, MomentsView, Pose, RenderSettings};
+use splatting::uncertainty::{self, BoundingBox, Uncertainty, UncertaintySettings};
+use splatting::{Backend, BackendError, Camera, Gaussian, Gaussians, Pose, RenderSettings};
 
-use crate::logic::footprint::BoundingBox;
 use crate::logic::score::{Candidate, ScoreSettings, score};
-use crate::logic::variance::{Moments, Uncertainty, uncertainty};
 
 /// Largest side of a scoring image, pixels.
 const MAX_SIDE_PX: u32 = 4096;
@@ -17,14 +16,12 @@ const MAX_SIDE_PX: u32 = 4096;
 /// A request that makes sense.
 #[derive(Debug, Clone)]
 pub struct Job {
-    mode: VarianceMode,
     settings: ScoreSettings,
-    bounding_box: BoundingBox,
+    uncertainty: UncertaintySettings,
     /// Camera, index on the grid and direction from the box centre of each view to be scored.
     candidates: Vec<(Camera, u32, DVec3)>,
     /// Directions of the views already taken.
     visited: Vec<DVec3>,
-    transparent_alpha: f64,
 }
 
 /// The terms of every candidate, in the order of the request.
@@ -47,6 +44,10 @@ impl Job {
         transparent_alpha: f64,
     ) -> Result<Self, String> {
         let mode = VarianceMode::from_code(request.variance)
+            .map(|mode| match mode {
+                VarianceMode::Paper => uncertainty::VarianceMode::Paper,
+                VarianceMode::Normalised => uncertainty::VarianceMode::Normalised,
+            })
             .ok_or_else(|| format!("variance code {} is unknown; expected 0 or 1", request.variance))?;
         for (side, value) in [("width", request.width), ("height", request.height)] {
             if !(8..=MAX_SIDE_PX).contains(&value) {
@@ -68,17 +69,19 @@ impl Job {
         }
         let center_m = DVec3::from_array(request.box_center_m);
         let mut job = Self {
-            mode,
             settings: ScoreSettings {
                 weight_uncertainty: request.weight_uncertainty,
                 weight_angle: request.weight_angle,
                 grid_candidates: request.grid_candidates,
                 clip_angle: request.clip_angle != 0,
             },
-            bounding_box: BoundingBox { center_m, size_m: request.box_size_m },
+            uncertainty: UncertaintySettings {
+                mode,
+                bounding_box: BoundingBox { center_m, size_m: request.box_size_m },
+                transparent_alpha,
+            },
             candidates: Vec::new(),
             visited: Vec::new(),
-            transparent_alpha,
         };
         for view in views {
             let position = DVec3::from_array(view.position_m);
@@ -136,26 +139,11 @@ impl Job {
         cancel: &AtomicBool,
         done: &AtomicU64,
     ) -> Result<Option<Scores>, BackendError> {
-        let views: Vec<MomentsView> = self
-            .candidates
-            .iter()
-            .map(|(camera, ..)| MomentsView {
-                camera: *camera,
-                reference_m: self.bounding_box.center_depth(camera) as f32,
-            })
-            .collect();
-        let seen = Mutex::new(vec![Uncertainty::default(); views.len()]);
+        let cameras: Vec<Camera> = self.candidates.iter().map(|(camera, ..)| *camera).collect();
+        let seen = Mutex::new(vec![Uncertainty::default(); cameras.len()]);
         // Early stop at T = 1e-4 (A8): the last of the transmittance carries the far surface.
-        let settings = RenderSettings::default();
-        let rendered = backend.moments_batch(model, &views, &settings, cancel, |index, image| {
-            let moments = Moments {
-                alpha: &image.alpha,
-                first: &image.first,
-                second: &image.second,
-                offset_m: f64::from(image.reference_m),
-            };
-            let camera = &views[index].camera;
-            let found = uncertainty(self.mode, camera, &self.bounding_box, &moments, self.transparent_alpha);
+        let settings = (&self.uncertainty, &RenderSettings::default());
+        let rendered = backend.uncertainties(model, &cameras, settings, cancel, |index, found| {
             if let Some(slot) = seen.lock().unwrap_or_else(PoisonError::into_inner).get_mut(index) {
                 *slot = found;
             }

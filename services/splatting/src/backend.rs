@@ -7,13 +7,14 @@ use thiserror::Error;
 
 use crate::camera::{Camera, RenderSettings};
 use crate::densify::Noise;
-use crate::engine::{Engine, EngineError, Moments, MomentsView, Rendered};
+use crate::engine::{Engine, EngineError, MomentsView, Rendered};
 use crate::gpu::{self, GpuError};
 use crate::model::Gaussians;
 use crate::optimiser::Optimiser;
 use crate::settings::{LossTerms, TrainingSettings};
 use crate::simd::Isa;
 use crate::statistics::ScreenStatistics;
+use crate::uncertainty::{Uncertainty, UncertaintySettings, uncertainty};
 use crate::view::TrainingView;
 use crate::workers::Workers;
 
@@ -155,21 +156,28 @@ impl Backend {
         Ok(())
     }
 
-    /// As [`Engine::moments_batch`].
+    /// How uncertain the model is about each of many views (Eq. 1-3): given to `visit` with the view's index, in no order
+    /// and from many threads. On the CPU one view is rendered and summed by one thread, so that the bits do not depend on
+    /// their number.
     ///
     /// # Errors
     /// [`BackendError::Cancelled`] where `cancel` became true, or where the GPU fails.
-    pub fn moments_batch(
+    pub fn uncertainties(
         &mut self,
         gaussians: &Gaussians,
-        views: &[MomentsView],
-        settings: &RenderSettings,
+        cameras: &[Camera],
+        (settings, render): (&UncertaintySettings, &RenderSettings),
         cancel: &AtomicBool,
-        visit: impl Fn(usize, &Moments) + Sync,
+        visit: impl Fn(usize, Uncertainty) + Sync,
     ) -> Result<(), BackendError> {
         match self {
-            Self::Cpu(engine) => engine.moments_batch(gaussians, views, settings, cancel, visit)?,
-            Self::Gpu(engine) => engine.moments_batch(gaussians, views, settings, cancel, visit)?,
+            Self::Cpu(engine) => {
+                let views: Vec<MomentsView> = cameras.iter().map(|camera| settings.view(camera)).collect();
+                engine.moments_batch(gaussians, &views, render, cancel, |index, moments| {
+                    visit(index, uncertainty(settings, &cameras[index], moments));
+                })?;
+            }
+            Self::Gpu(engine) => engine.uncertainties(gaussians, cameras, (settings, render), cancel, visit)?,
         }
         Ok(())
     }

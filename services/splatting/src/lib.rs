@@ -40,6 +40,7 @@ mod statistics;
 #[cfg(test)]
 mod tests;
 mod training;
+pub mod uncertainty;
 mod view;
 mod workers;
 

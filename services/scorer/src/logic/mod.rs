@@ -1,5 +1,3 @@
 //! The scorer's logic: no IPC, no clock; images and views come in as arguments.
 
-pub mod footprint;
 pub mod score;
-pub mod variance;

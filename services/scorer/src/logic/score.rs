@@ -3,7 +3,7 @@
 use glam::DVec3;
 use shared_types::messages::CandidateScore;
 
-use super::variance::Uncertainty;
+use splatting::uncertainty::Uncertainty;
 
 /// What Eq. 4 needs to know.
 #[derive(Debug, Clone, Copy, PartialEq)]

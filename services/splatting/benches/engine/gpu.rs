@@ -4,8 +4,10 @@ use std::hint::black_box;
 use std::sync::atomic::AtomicBool;
 use std::time::Instant;
 
+use glam::DVec3;
 use splatting::gpu::{Engine, Options as Adapter, adapters};
-use splatting::{Optimiser, RenderSettings, ScreenStatistics};
+use splatting::uncertainty::{BoundingBox, UncertaintySettings, VarianceMode};
+use splatting::{Camera, Optimiser, RenderSettings, ScreenStatistics};
 
 use crate::machine::Machine;
 use crate::report::{self, Row};
@@ -98,10 +100,14 @@ fn train(options: &Options, engine: &mut Engine, count: usize) -> Result<Row, Bo
 
 fn score(options: &Options, engine: &mut Engine, count: usize) -> Result<Row, Box<dyn std::error::Error>> {
     let (model, views) = (scene::model(count), score_views("score95"));
+    let cameras: Vec<Camera> = views.iter().map(|view| view.camera).collect();
     let (cancel, settings) = (AtomicBool::new(false), RenderSettings::default());
+    // What the scorer asks: the box about the object.
+    let bounding_box = BoundingBox { center_m: DVec3::ZERO, size_m: 2.0 };
+    let asked = UncertaintySettings { mode: VarianceMode::Normalised, bounding_box, transparent_alpha: 0.1 };
     let mut once = || {
-        engine.moments_batch(&model, &views, &settings, &cancel, |_, moments| {
-            black_box(moments);
+        engine.uncertainties(&model, &cameras, (&asked, &settings), &cancel, |_, found| {
+            black_box(found);
         })
     };
     once()?;

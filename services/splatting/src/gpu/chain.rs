@@ -60,9 +60,9 @@ impl Size {
         self.gaussians.div_ceil(256).max(1)
     }
 
-    /// Bytes of the largest buffers that each view needs.
-    pub fn bytes_per_view(&self) -> [u64; 3] {
-        [48 * u64::from(self.gaussians), 4 * u64::from(self.capacity), 12 * self.pixels()]
+    /// Bytes of the largest buffers that each view needs, with those that it leaves.
+    pub fn bytes_per_view(&self, out_bytes: u64) -> [u64; 3] {
+        [48 * u64::from(self.gaussians), 4 * u64::from(self.capacity), out_bytes]
     }
 
     /// A first guess of the pairs of a view.
@@ -90,6 +90,8 @@ impl Size {
 /// Buffers and bindings of a chain.
 pub(super) struct Chain {
     pub size: Size,
+    /// Views that are drawn, at most as many as `size` has room for.
+    pub views: u32,
     pub rows: Buffer,
     pub boxes: Buffer,
     pub entries: Buffer,
@@ -156,12 +158,12 @@ impl Chain {
             kernels.bin_fill.bind(context, 0, &[jobs, &control, &order[0], &boxes, &table, &entries]),
         ];
         context.check()?;
-        Ok(Self { size, rows, boxes, entries, starts, control, bytes, project, sort: passes, bin })
+        Ok(Self { size, views: size.views, rows, boxes, entries, starts, control, bytes, project, sort: passes, bin })
     }
 
     /// Records one of the stages that lead to the lists. `offsets` are those of the job and of the views.
     pub fn record(&self, stage: Listing, pass: &mut ComputePass<'_>, kernels: &Kernels, offsets: &[u32; 2]) {
-        let (job, views) = (self.size.job(), self.size.views);
+        let (job, views) = (self.size.job(), self.views);
         match stage {
             Listing::Project => {
                 let (x, y) = fold(self.size.parameter_groups());

@@ -1,33 +1,28 @@
 //! The GPU engine: what the CPU engine does, on an adapter.
 
-use std::sync::atomic::{AtomicBool, Ordering};
-
-use bytemuck::{bytes_of, cast_slice, pod_collect_to_vec};
-use rayon::prelude::*;
-use wgpu::{Buffer, BufferUsages, ComputePassDescriptor, Features};
+use bytemuck::pod_collect_to_vec;
+use wgpu::Features;
 
 use super::adapter;
 use super::buffers::Bytes;
-use super::chain::{Chain, Size, dispatch, views_buffer};
+use super::chain::{Size, dispatch};
 use super::context::Context;
+use super::drawing::{Drawing, overflow};
 use super::error::GpuError;
-use super::job::{CONTROL_HALT, CONTROL_PAIRS, JOB_BYTES, Job, VIEWS_MAX, View};
+use super::job::View;
 use super::kernels::Kernels;
 use super::model::{DeviceModel, blocks_of, lanes_of};
 use super::peak;
 use super::training::{Gradients, Keyframes, STAGES, Trainer};
 use crate::camera::{Camera, RenderSettings};
 use crate::densify::Noise;
-use crate::engine::{DEPTH_ALPHA_TINY, Moments, MomentsView, Rendered};
+use crate::engine::{DEPTH_ALPHA_TINY, Rendered};
 use crate::model::{Gaussians, LANES, ROWS, SH_REST_MAX, sh_rest_coefficients, sh_rest_rows};
 use crate::optimiser::Optimiser;
 use crate::settings::{LossTerms, TrainingSettings};
 use crate::statistics::ScreenStatistics;
 use crate::training::Gradient;
 use crate::view::TrainingView;
-
-/// Most bytes of a batch of views; more views are rendered one batch after the other.
-const BATCH_BYTES: u64 = 256 << 20;
 
 /// Which adapter, and what of it to use.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
@@ -47,8 +42,8 @@ pub struct Options {
 
 /// The renderer and trainer on a GPU.
 pub struct Engine {
-    context: Context,
-    kernels: Kernels,
+    pub(super) context: Context,
+    pub(super) kernels: Kernels,
     model: Option<DeviceModel>,
     trainer: Option<Trainer>,
     keyframes: Keyframes,
@@ -101,7 +96,7 @@ impl Engine {
     }
 
     /// A quarter more than was needed: the number changes from view to view.
-    fn make_room(&mut self, pairs: u32) {
+    pub(super) fn make_room(&mut self, pairs: u32) {
         self.pairs = pairs.saturating_add(pairs / 4).max(1024);
     }
 
@@ -126,7 +121,8 @@ impl Engine {
         let bytes = loop {
             let size = self.size(&model, 1, camera);
             let reached = self.context.storage("tile lists", 4 * u64::from(size.tiles() + size.capacity))?;
-            let drawing = Drawing::new(self, &model, size, &[View::new(camera, settings, 0.0)], settings.sh_degree)?;
+            let mut drawing = Drawing::new(self, &model, size, settings.sh_degree)?;
+            drawing.describe(&self.context, &[View::new(camera, settings, 0.0)]);
             let chain = &drawing.chain;
             let blend = self.kernels.blend.bind(
                 &self.context,
@@ -155,89 +151,10 @@ impl Engine {
         Ok(())
     }
 
-    /// Renders the moments of many views in as few chains as their memory allows, and gives each to `visit`, as
-    /// [`crate::Engine::moments_batch`]. Views of other sizes than the first make chains of their own.
-    ///
-    /// # Errors
-    /// [`GpuError::Cancelled`] where `cancel` became true before the last chain was begun; otherwise where the GPU fails.
-    pub fn moments_batch(
-        &mut self,
-        gaussians: &Gaussians,
-        views: &[MomentsView],
-        settings: &RenderSettings,
-        cancel: &AtomicBool,
-        visit: impl Fn(usize, &Moments) + Sync,
-    ) -> Result<(), GpuError> {
-        let model = DeviceModel::upload(&self.context, gaussians, None)?;
-        let mut done = 0;
-        while done < views.len() {
-            if cancel.load(Ordering::Relaxed) {
-                return Err(GpuError::Cancelled);
-            }
-            let camera = views[done].camera;
-            let fits = |view: &MomentsView| (view.camera.width, view.camera.height) == (camera.width, camera.height);
-            let same = views[done..].iter().take_while(|view| fits(view)).count();
-            let room = self.views_at_once(&self.size(&model, 1, &camera));
-            let batch = &views[done..done + same.min(room)];
-            if self.moments_of(&model, batch, settings, |index, moments| visit(done + index, moments))? {
-                done += batch.len();
-            }
-        }
-        Ok(())
-    }
-
-    /// One chain of views of one size; `false` where lists did not fit: there is more room now.
-    fn moments_of(
-        &mut self,
-        model: &DeviceModel,
-        views: &[MomentsView],
-        settings: &RenderSettings,
-        visit: impl Fn(usize, &Moments) + Sync,
-    ) -> Result<bool, GpuError> {
-        let camera = &views[0].camera;
-        let (width, height, pixels) = (camera.width, camera.height, camera.pixels());
-        let count = views.len() as u32;
-        let size = self.size(model, count, camera);
-        let bytes = 12 * pixels as u64 * u64::from(count);
-        let out = self.context.storage("moments", bytes)?;
-        let described: Vec<View> =
-            views.iter().map(|view| View::new(&view.camera, settings, view.reference_m)).collect();
-        let drawing = Drawing::new(self, model, size, &described, 0)?;
-        let chain = &drawing.chain;
-        let group = self.kernels.moments.bind(
-            &self.context,
-            count.into(),
-            &[&drawing.job, &drawing.views, &chain.rows, &chain.starts, &chain.entries, &out],
-        );
-        drawing.run(self, |pass, kernels| {
-            dispatch(pass, &kernels.moments, &group, &[0, 0], (size.tiles_x(), size.tiles_y(), count));
-        })?;
-        let [control, bytes] = self.context.read([(&drawing.chain.control, 16), (&out, bytes)])?;
-        if let Some(pairs) = overflow(&control) {
-            self.make_room(pairs);
-            return Ok(false);
-        }
-        let planes: Vec<f32> = pod_collect_to_vec(&bytes);
-        planes.par_chunks(3 * pixels.max(1)).enumerate().for_each(|(index, planes)| {
-            let plane = |k: usize| planes[k * pixels..(k + 1) * pixels].to_vec();
-            let reference_m = views[index].reference_m;
-            visit(index, &Moments { width, height, reference_m, alpha: plane(0), first: plane(1), second: plane(2) });
-        });
-        Ok(true)
-    }
-
-    fn size(&self, model: &DeviceModel, views: u32, camera: &Camera) -> Size {
+    pub(super) fn size(&self, model: &DeviceModel, views: u32, camera: &Camera) -> Size {
         let gaussians = model.gaussians;
         let (width, height) = (camera.width, camera.height);
         Size { gaussians, views, width, height, capacity: self.likely_pairs(gaussians) }
-    }
-
-    /// Views of this size that fit a chain.
-    fn views_at_once(&self, size: &Size) -> usize {
-        let parts = size.bytes_per_view();
-        let by_binding = parts.iter().map(|&bytes| self.context.max_binding / bytes.max(1)).min().unwrap_or(1);
-        let by_memory = BATCH_BYTES / parts.iter().sum::<u64>().max(1);
-        by_binding.min(by_memory).clamp(1, VIEWS_MAX.into()) as usize
     }
 
     /// Puts a model under training on the GPU. From now on [`Engine::step`] changes it there.
@@ -440,47 +357,5 @@ impl Engine {
         let size = trainer.size();
         self.make_room(pairs);
         self.replace_trainer(Size { capacity: self.pairs, ..size })
-    }
-}
-
-/// How many pairs a view had, where there was no room for them.
-fn overflow(control: &[u8]) -> Option<u32> {
-    let words: Vec<u32> = pod_collect_to_vec(control);
-    (words[CONTROL_HALT] != 0).then(|| words[CONTROL_PAIRS])
-}
-
-/// A chain that is run once.
-struct Drawing {
-    job: Buffer,
-    views: Buffer,
-    chain: Chain,
-}
-
-impl Drawing {
-    fn new(engine: &Engine, model: &DeviceModel, size: Size, views: &[View], sh_degree: u8) -> Result<Self, GpuError> {
-        let context = &engine.context;
-        let job = context.buffer("jobs", JOB_BYTES, BufferUsages::UNIFORM | BufferUsages::COPY_DST);
-        let degree = model.sh_degree.min(sh_degree);
-        let described = Job {
-            bands: sh_rest_coefficients(degree) as u32,
-            band_rows: sh_rest_rows(model.sh_degree) as u32,
-            ..size.job()
-        };
-        context.queue.write_buffer(&job, 0, bytes_of(&described));
-        let buffer = views_buffer(context, size.views)?;
-        context.queue.write_buffer(&buffer, 0, cast_slice(views));
-        let chain = Chain::new(context, &engine.kernels, model, size, (&job, &buffer))?;
-        Ok(Self { job, views: buffer, chain })
-    }
-
-    /// Runs the chain and what `last` records after it.
-    fn run(&self, engine: &Engine, last: impl FnOnce(&mut wgpu::ComputePass<'_>, &Kernels)) -> Result<(), GpuError> {
-        let mut encoder = engine.context.encoder();
-        let mut pass = encoder.begin_compute_pass(&ComputePassDescriptor::default());
-        self.chain.record_all(&mut pass, &engine.kernels, &[0, 0]);
-        last(&mut pass, &engine.kernels);
-        drop(pass);
-        engine.context.queue.submit([encoder.finish()]);
-        engine.context.check()
     }
 }

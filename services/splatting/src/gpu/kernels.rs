@@ -43,6 +43,7 @@ const PROJECTION: &str = shader!("projection");
 const HARMONICS: &str = shader!("harmonics");
 const PARAMETERS: &str = shader!("parameters");
 const TILE_LISTS: &str = shader!("tile_lists");
+const MOMENTS: &str = shader!("moments");
 const KEYFRAME: &str = shader!("keyframe");
 const BACKWARD: &str = shader!("backward");
 const SORT_MOVE: &str = shader!("sort_move");
@@ -101,9 +102,15 @@ pub(super) const SOURCES: &[Source] = &[
         group1: &[],
     },
     Source {
-        name: "moments",
-        parts: &[JOB, TILE_LISTS, shader!("moments")],
+        name: "moments_store",
+        parts: &[JOB, TILE_LISTS, MOMENTS, shader!("moments_store")],
         group0: &[Job, Views, Read, Read, Read, Write],
+        group1: &[],
+    },
+    Source {
+        name: "moments_variance",
+        parts: &[JOB, TILE_LISTS, MOMENTS, shader!("moments_variance")],
+        group0: &[Job, Views, Read, Read, Read, Write, Read, Read],
         group1: &[],
     },
     Source {
@@ -284,7 +291,8 @@ pub(super) struct Kernels {
     pub bin_offsets: Kernel,
     pub bin_fill: Kernel,
     pub blend: Kernel,
-    pub moments: Kernel,
+    pub moments_store: Kernel,
+    pub moments_variance: Kernel,
     pub ssim: Kernel,
     pub loss: Kernel,
     pub backward: Kernel,
@@ -309,7 +317,8 @@ impl Kernels {
             bin_offsets: kernel("bin_offsets")?,
             bin_fill: kernel("bin_fill")?,
             blend: kernel("blend")?,
-            moments: kernel("moments")?,
+            moments_store: kernel("moments_store")?,
+            moments_variance: kernel("moments_variance")?,
             ssim: kernel("ssim")?,
             loss: kernel("loss")?,
             backward: kernel(match has(Features::SHADER_FLOAT32_ATOMIC) {

@@ -11,6 +11,7 @@ mod buffers;
 mod chain;
 mod check;
 mod context;
+mod drawing;
 mod engine;
 mod error;
 mod iteration;
@@ -19,6 +20,7 @@ mod kernels;
 mod keyframe;
 mod model;
 mod peak;
+mod scoring;
 #[cfg(test)]
 mod tests;
 mod training;

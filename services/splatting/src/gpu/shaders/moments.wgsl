@@ -1,12 +1,11 @@
-// Forward blending of the moments of depth (A1, A7) of every view of a chain: Σ w, Σ w (d - d0), Σ w (d - d0)².
+// Forward blending of the moments of depth (A1, A7) of every view of a chain: Σ w, Σ w (d - d0), Σ w (d - d0)². What becomes
+// of a pixel's is in `moments_store.wgsl` and in `moments_variance.wgsl`.
 
 @group(0) @binding(0) var<uniform> job: Job;
 @group(0) @binding(1) var<storage, read> views: array<View>;
 @group(0) @binding(2) var<storage, read> rows: array<vec4f>;
 @group(0) @binding(3) var<storage, read> starts: array<u32>;
 @group(0) @binding(4) var<storage, read> entries: array<u32>;
-/// Three planes of each view.
-@group(0) @binding(5) var<storage, read_write> moments: array<f32>;
 
 @compute @workgroup_size(256)
 fn main(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) local: u32) {
@@ -47,11 +46,5 @@ fn main(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lo
         }
         alive &= blocks_going(local, transmittance, limit);
     }
-    if pixel.x < job.width && pixel.y < job.height {
-        let pixels = job.width * job.height;
-        let at = 3u * view * pixels + pixel.y * job.width + pixel.x;
-        moments[at] = 1.0 - transmittance;
-        moments[at + pixels] = first_moment;
-        moments[at + 2u * pixels] = second_moment;
-    }
+    take(view, group.xy, pixel, local, 1.0 - transmittance, first_moment, second_moment);
 }

@@ -8,6 +8,7 @@ mod densify;
 mod edges;
 mod forward;
 mod gradients;
+mod scoring;
 mod training;
 
 use std::sync::{Mutex, OnceLock, PoisonError};

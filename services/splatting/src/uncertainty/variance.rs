@@ -5,24 +5,11 @@
 //! `m1 = sum w (d - c)`, `m2 = sum w (d - c)^2`. The printed variance is not indifferent to c where A < 1, so it is
 //! taken back exactly: `sum w d^2 - (sum w d)^2 = m2 - m1^2 + 2 c m1 (1 - A) + c^2 A (1 - A)`.
 
+use super::footprint;
+use super::{UncertaintySettings, VarianceMode};
+use crate::camera::Camera;
+use crate::engine::Moments;
 use glam::DVec2;
-use shared_types::messages::VarianceMode;
-use splatting::Camera;
-
-use super::footprint::{self, BoundingBox};
-
-/// Accumulated alpha and depth moments of an image, row by row.
-#[derive(Debug, Clone, Copy)]
-pub struct Moments<'a> {
-    /// A: sum of the weights w.
-    pub alpha: &'a [f32],
-    /// Sum of w (d - c), metres.
-    pub first: &'a [f32],
-    /// Sum of w (d - c)^2, square metres.
-    pub second: &'a [f32],
-    /// c: the depth that the moments are relative to, metres.
-    pub offset_m: f64,
-}
 
 /// What a candidate sees (Eq. 3).
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
@@ -67,15 +54,11 @@ pub fn pixel_variance(
 
 /// The uncertainty of one candidate (Eq. 3), over the pixels inside the projected box.
 #[must_use]
-pub fn uncertainty(
-    mode: VarianceMode,
-    camera: &Camera,
-    bounding_box: &BoundingBox,
-    moments: &Moments<'_>,
-    transparent_alpha: f64,
-) -> Uncertainty {
+pub fn uncertainty(settings: &UncertaintySettings, camera: &Camera, moments: &Moments) -> Uncertainty {
+    let &UncertaintySettings { mode, bounding_box, transparent_alpha } = settings;
     let outline = bounding_box.outline(camera);
-    let (mut count, mut variances, mut alphas, mut transparent) = (0u32, 0.0, 0.0, 0u32);
+    let offset_m = f64::from(moments.reference_m);
+    let mut sums = Sums::default();
     for (row, first, end) in footprint::covered_pixels(&outline, camera.width, camera.height) {
         for column in first..end {
             let index = row as usize * camera.width as usize + column as usize;
@@ -92,34 +75,53 @@ pub fn uncertainty(
                 0.0
             };
             let values = (alpha, f64::from(m1), f64::from(m2));
-            variances +=
-                pixel_variance(mode, values, moments.offset_m, chord_m, bounding_box.size_m, transparent_alpha);
-            alphas += alpha;
-            transparent += u32::from(alpha < transparent_alpha);
-            count += 1;
+            sums.variance += pixel_variance(mode, values, offset_m, chord_m, bounding_box.size_m, transparent_alpha);
+            sums.alpha += alpha;
+            sums.transparent += f64::from(u8::from(alpha < transparent_alpha));
+            sums.pixels += 1;
         }
     }
-    if count == 0 {
-        return Uncertainty::default();
-    }
-    let count = f64::from(count);
-    let mean_variance_m2 = variances / count;
-    let area_fraction = footprint::area(&outline) / (f64::from(camera.width) * f64::from(camera.height));
-    Uncertainty {
-        mean_variance_m2,
-        area_fraction,
-        uncertainty: mean_variance_m2 * area_fraction,
-        mean_alpha: alphas / count,
-        transparent_fraction: f64::from(transparent) / count,
+    sums.uncertainty(footprint::area(&outline) / (f64::from(camera.width) * f64::from(camera.height)))
+}
+
+/// Sums over the pixels inside the projected box.
+#[derive(Debug, Clone, Copy, Default)]
+pub(crate) struct Sums {
+    /// Of variance, m^2.
+    pub variance: f64,
+    /// Of alpha.
+    pub alpha: f64,
+    /// Pixels that are transparent.
+    pub transparent: f64,
+    /// Pixels.
+    pub pixels: u32,
+}
+
+impl Sums {
+    /// Means, where the box covers this share of the image.
+    pub fn uncertainty(&self, area_fraction: f64) -> Uncertainty {
+        if self.pixels == 0 {
+            return Uncertainty::default();
+        }
+        let pixels = f64::from(self.pixels);
+        let mean_variance_m2 = self.variance / pixels;
+        Uncertainty {
+            mean_variance_m2,
+            area_fraction,
+            uncertainty: mean_variance_m2 * area_fraction,
+            mean_alpha: self.alpha / pixels,
+            transparent_fraction: self.transparent / pixels,
+        }
     }
 }
 
 #[cfg(test)]
 mod tests {
     use glam::{DVec3, Vec3};
-    use splatting::Pose;
 
     use super::*;
+    use crate::camera::Pose;
+    use crate::uncertainty::BoundingBox;
 
     /// Moments of layers (depth, opacity) from front to back, about `offset`.
     fn layers(layers: &[(f64, f64)], offset: f64) -> (f64, f64, f64) {
@@ -173,16 +175,26 @@ mod tests {
         assert_eq!(pixel_variance(VarianceMode::Normalised, (0.9, 0.3, 0.0999), 2.0, 0.5, 2.0, 0.1), 0.0);
     }
 
+    /// Of one alpha everywhere, all of it at the reference depth.
+    fn image(alpha: f32) -> Moments {
+        let plane = |value| vec![value; 96 * 72];
+        let (first, second) = (plane(0.0), plane(0.0));
+        Moments { width: 96, height: 72, reference_m: 3.0, alpha: plane(alpha), first, second }
+    }
+
     #[test]
     fn an_empty_model_has_the_variance_of_not_knowing() {
         let camera =
             Camera::from_hfov(Pose::IDENTITY, 1.204, 96, 72).look_at(Vec3::new(0.0, -3.0, 0.0), Vec3::ZERO, Vec3::Z);
         let cube = BoundingBox { center_m: DVec3::ZERO, size_m: 1.0 };
-        let zeros = vec![0.0; 96 * 72];
-        let moments = Moments { alpha: &zeros, first: &zeros, second: &zeros, offset_m: 3.0 };
-        let paper = uncertainty(VarianceMode::Paper, &camera, &cube, &moments, 0.1);
+        let moments = image(0.0);
+        let seen = |mode| {
+            let settings = UncertaintySettings { mode, bounding_box: cube, transparent_alpha: 0.1 };
+            uncertainty(&settings, &camera, &moments)
+        };
+        let paper = seen(VarianceMode::Paper);
         assert!((paper.mean_variance_m2 - 0.25).abs() < 1e-12 && paper.transparent_fraction == 1.0);
-        let ours = uncertainty(VarianceMode::Normalised, &camera, &cube, &moments, 0.1);
+        let ours = seen(VarianceMode::Normalised);
         // Seen face on, most rays cross the whole metre (1/12 m^2); those near the outline cross less.
         assert!(ours.mean_variance_m2 > 0.05 && ours.mean_variance_m2 < 1.0 / 12.0, "{}", ours.mean_variance_m2);
         assert!((ours.uncertainty - ours.mean_variance_m2 * ours.area_fraction).abs() < 1e-15);
@@ -194,10 +206,9 @@ mod tests {
         let camera =
             Camera::from_hfov(Pose::IDENTITY, 1.204, 96, 72).look_at(Vec3::new(0.0, -3.0, 0.0), Vec3::ZERO, Vec3::Z);
         let cube = BoundingBox { center_m: DVec3::ZERO, size_m: 1.0 };
-        let (ones, zeros) = (vec![1.0; 96 * 72], vec![0.0; 96 * 72]);
-        let moments = Moments { alpha: &ones, first: &zeros, second: &zeros, offset_m: 3.0 };
         for mode in [VarianceMode::Paper, VarianceMode::Normalised] {
-            let seen = uncertainty(mode, &camera, &cube, &moments, 0.1);
+            let settings = UncertaintySettings { mode, bounding_box: cube, transparent_alpha: 0.1 };
+            let seen = uncertainty(&settings, &camera, &image(1.0));
             assert!(seen.uncertainty.abs() < 1e-12 && seen.mean_alpha == 1.0 && seen.transparent_fraction == 0.0);
         }
     }

@@ -4,7 +4,8 @@
 //! Unclipped, the hull can exceed the image, and the area fraction of Eq. 3 would exceed 1.
 
 use glam::{DVec2, DVec3};
-use splatting::Camera;
+
+use crate::camera::Camera;
 
 /// Nearest depth at which a corner is projected, metres: nearer parts of the box are cut off.
 const NEAR_M: f64 = 0.05;
@@ -172,9 +173,9 @@ fn clip_to_image(polygon: &[DVec2], width: f64, height: f64) -> Vec<DVec2> {
 #[cfg(test)]
 mod tests {
     use glam::Vec3;
-    use splatting::Pose;
 
     use super::*;
+    use crate::camera::Pose;
 
     fn camera(eye: Vec3) -> Camera {
         Camera::from_hfov(Pose::IDENTITY, 1.204, 320, 240).look_at(eye, Vec3::ZERO, Vec3::Z)
