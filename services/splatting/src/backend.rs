@@ -193,6 +193,15 @@ enum Newest {
     Both,
 }
 
+/// A copy of the model for somebody else.
+#[derive(Debug, Default)]
+enum Copy {
+    #[default]
+    None,
+    OnItsWay,
+    Here(Box<Gaussians>),
+}
+
 /// A model and its optimiser under training, wherever they are.
 ///
 /// On the CPU a step is done when it returns. On a GPU it is done later: losses arrive with [`Training::finished`], and the
@@ -204,6 +213,7 @@ pub struct Training {
     optimiser: Optimiser,
     statistics: ScreenStatistics,
     newest: Newest,
+    copy: Copy,
     finished: Vec<LossTerms>,
 }
 
@@ -216,6 +226,7 @@ impl Training {
             optimiser: Optimiser::new(),
             statistics: ScreenStatistics::new(),
             newest: Newest::Host,
+            copy: Copy::None,
             finished: Vec::new(),
         }
     }
@@ -269,6 +280,7 @@ impl Training {
     pub fn restore_observed(&mut self, gaussians: Gaussians, optimiser: Optimiser, statistics: ScreenStatistics) {
         (self.gaussians, self.optimiser, self.statistics) = (gaussians, optimiser, statistics);
         self.newest = Newest::Host;
+        self.forget_copy();
         self.finished.clear();
     }
 
@@ -290,9 +302,8 @@ impl Training {
     /// # Errors
     /// As [`Training::sync`].
     pub fn parts_mut(&mut self) -> Result<(&mut Gaussians, &mut Optimiser), BackendError> {
-        self.sync()?;
-        self.newest = Newest::Host;
-        Ok((&mut self.gaussians, &mut self.optimiser))
+        let (model, optimiser, _) = self.lists_mut()?;
+        Ok((model, optimiser))
     }
 
     /// Model, optimiser and statistics, to change all alike.
@@ -302,9 +313,52 @@ impl Training {
     pub fn lists_mut(&mut self) -> Result<(&mut Gaussians, &mut Optimiser, &mut ScreenStatistics), BackendError> {
         self.sync()?;
         self.newest = Newest::Host;
+        self.forget_copy();
         self.optimiser.fit(&self.gaussians);
         self.statistics.fit(&self.gaussians);
         Ok((&mut self.gaussians, &mut self.optimiser, &mut self.statistics))
+    }
+
+    /// Begins to copy the model as the steps asked for so far leave it, while training goes on. What changes the list of
+    /// Gaussians forgets the copy.
+    ///
+    /// # Errors
+    /// Where the GPU fails.
+    pub fn begin_copy(&mut self) -> Result<(), BackendError> {
+        self.copy = match (&mut self.backend, self.newest) {
+            (Backend::Gpu(engine), Newest::Gpu) => {
+                engine.begin_copy()?;
+                Copy::OnItsWay
+            }
+            _ => Copy::Here(Box::new(self.gaussians.clone())),
+        };
+        Ok(())
+    }
+
+    /// The copy that was begun, once it is here; with `wait` it is waited for. `None` also where there is none.
+    ///
+    /// # Errors
+    /// Where the GPU fails.
+    pub fn take_copy(&mut self, wait: bool) -> Result<Option<Gaussians>, BackendError> {
+        match (std::mem::take(&mut self.copy), &mut self.backend) {
+            (Copy::Here(gaussians), _) => Ok(Some(*gaussians)),
+            (Copy::OnItsWay, Backend::Gpu(engine)) => {
+                let mut gaussians = self.gaussians.clone();
+                if engine.take_copy(&mut gaussians, wait)? {
+                    return Ok(Some(gaussians));
+                }
+                self.copy = Copy::OnItsWay;
+                Ok(None)
+            }
+            _ => Ok(None),
+        }
+    }
+
+    fn forget_copy(&mut self) {
+        self.copy = Copy::None;
+        if let Backend::Gpu(engine) = &mut self.backend {
+            engine.forget_copy();
+        }
     }
 
     /// Asks for one step of Adam on one view.

@@ -93,6 +93,8 @@ pub struct Session {
     /// Whether the views of steps whose losses are not known yet have foreground.
     have_foreground: VecDeque<bool>,
     pub(crate) progression: Progression,
+    /// What a snapshot that is on its way will say.
+    snapshot_begun: Option<Snapshot>,
     /// Keyframes prepared for training, and the clip box that their masks are for.
     views: BTreeMap<u64, View>,
     views_clip: Option<ClipBox>,
@@ -117,6 +119,7 @@ impl Session {
             training: Training::new(backend),
             have_foreground: VecDeque::new(),
             progression: Progression::new(),
+            snapshot_begun: None,
             views: BTreeMap::new(),
             views_clip: None,
         }
@@ -301,12 +304,38 @@ impl Session {
     /// [`Session::sync`].
     #[must_use]
     pub fn snapshot(&self) -> Option<Snapshot> {
+        Some(Snapshot { rows: rows(self.model()), ..self.untaken_snapshot()? })
+    }
+
+    /// Begins a snapshot of the model as it is now, which training does not wait for.
+    ///
+    /// # Errors
+    /// When the back end failed.
+    pub fn begin_snapshot(&mut self) -> Result<(), BackendError> {
+        self.snapshot_begun = self.untaken_snapshot();
+        self.training.begin_copy()
+    }
+
+    /// The snapshot that was begun, once the model has arrived; with `wait` it is waited for.
+    ///
+    /// # Errors
+    /// When the back end failed.
+    pub fn take_snapshot(&mut self, wait: bool) -> Result<Option<Snapshot>, BackendError> {
+        if self.snapshot_begun.is_none() {
+            return Ok(None);
+        }
+        let model = self.training.take_copy(wait)?;
+        Ok(model.and_then(|model| Some(Snapshot { rows: rows(&model), ..self.snapshot_begun.take()? })))
+    }
+
+    /// A snapshot without its rows.
+    fn untaken_snapshot(&self) -> Option<Snapshot> {
         let (generation, is_final) = self.generation_now()?;
         Some(Snapshot {
             generation,
             total_iterations: self.progression.total_iterations,
             is_final,
-            rows: self.model().iter().map(|gaussian| row(&gaussian)).collect(),
+            rows: Vec::new(),
             spec: self.active().or(self.finished().last().map(|round| &round.spec))?.clone(),
         })
     }
@@ -468,6 +497,7 @@ impl Session {
     pub(crate) fn restore(&mut self, model: Gaussians, optimiser: Optimiser, progression: Progression) {
         self.training.restore(model, optimiser);
         self.have_foreground.clear();
+        self.snapshot_begun = None;
         self.progression = progression;
     }
 }
@@ -485,6 +515,10 @@ fn insertion_rules(config: &TrainerConfig) -> InsertionRules {
         max_depth_jump: config.max_depth_jump as f32,
         reseed_ratio: config.reseed_ratio as f32,
     }
+}
+
+fn rows(model: &Gaussians) -> Vec<GaussianRow> {
+    model.iter().map(|gaussian| row(&gaussian)).collect()
 }
 
 /// A Gaussian as on channels: its rotation has unit length there.

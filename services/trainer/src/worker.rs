@@ -3,6 +3,7 @@
 //! The service's loop must answer every tick, so it never computes. In lockstep everything that the thread does depends on
 //! iteration counts alone ([`Pace::Counted`]); how fast it is decides only how long a due tick has to wait.
 
+use std::collections::VecDeque;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
@@ -22,6 +23,17 @@ use crate::session::{Session, SessionError, Snapshot};
 
 /// Results that may wait to be published: bounds how far the thread runs ahead of the mission clock, and its memory.
 const AHEAD: usize = 8;
+
+/// Slices that may wait for a snapshot to arrive.
+const HELD: usize = 4;
+
+/// A slice that is computed, before it is handed over.
+#[derive(Debug, Clone, Copy)]
+struct Slice {
+    progress: Progress,
+    over: bool,
+    with_snapshot: bool,
+}
 
 /// When snapshots and checkpoints are taken within a round.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -311,6 +323,8 @@ impl Thread {
 
     /// Trains to the round's end; false when it was asked to stop before.
     fn train(&mut self) -> Result<bool, End> {
+        // Slices whose turn comes once a snapshot that was begun before them has arrived.
+        let mut held: VecDeque<Slice> = VecDeque::new();
         loop {
             let before = self.session.progress().iterations;
             let work = &self.signals.work;
@@ -326,15 +340,34 @@ impl Thread {
                 return Ok(false);
             }
             if progress.iterations == before {
+                self.hand_over(&mut held, true)?;
                 return Ok(true);
             }
             let wanted = !over && self.is_due(before, progress.iterations, true);
-            let snapshot = if wanted { self.synced()?.snapshot() } else { None };
-            self.send(Output::Slice { progress, over, snapshot })?;
+            if wanted {
+                self.hand_over(&mut held, true)?;
+                self.session.begin_snapshot()?;
+            }
+            held.push_back(Slice { progress, over, with_snapshot: wanted });
+            let all = over || held.len() > HELD;
+            self.hand_over(&mut held, all)?;
             if over {
                 return Ok(true);
             }
         }
+    }
+
+    /// Sends slices in their order, up to the first whose snapshot has not arrived; with `all`, it is waited for.
+    fn hand_over(&mut self, held: &mut VecDeque<Slice>, all: bool) -> Result<(), End> {
+        while let Some(&Slice { progress, over, with_snapshot }) = held.front() {
+            let snapshot = if with_snapshot { self.session.take_snapshot(all)? } else { None };
+            if with_snapshot && snapshot.is_none() && !all {
+                break;
+            }
+            held.pop_front();
+            self.send(Output::Slice { progress, over, snapshot })?;
+        }
+        Ok(())
     }
 
     fn is_due(&self, before: u32, now: u32, snapshot: bool) -> bool {

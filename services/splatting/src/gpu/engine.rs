@@ -1,12 +1,13 @@
 //! The GPU engine: what the CPU engine does, on an adapter.
 
 use bytemuck::pod_collect_to_vec;
-use wgpu::Features;
+use wgpu::{Buffer, Features};
 
 use super::adapter;
 use super::buffers::Bytes;
 use super::chain::{Size, dispatch};
 use super::context::Context;
+use super::copying::Copying;
 use super::drawing::{Drawing, overflow};
 use super::error::GpuError;
 use super::job::View;
@@ -44,9 +45,14 @@ pub struct Options {
 pub struct Engine {
     pub(super) context: Context,
     pub(super) kernels: Kernels,
-    model: Option<DeviceModel>,
-    trainer: Option<Trainer>,
-    keyframes: Keyframes,
+    pub(super) model: Option<DeviceModel>,
+    pub(super) trainer: Option<Trainer>,
+    pub(super) keyframes: Keyframes,
+    pub(super) copying: Option<Copying>,
+    /// Where the last copy came through.
+    pub(super) copy_staging: Option<Buffer>,
+    /// How often iterations were taken back because lists did not fit.
+    pub(super) taken_back: u64,
     /// Pairs per view that were needed so far, with something to spare.
     pairs: u32,
 }
@@ -63,7 +69,17 @@ impl Engine {
         excluded.set(Features::SHADER_FLOAT32_ATOMIC, options.without_float_atomics);
         let context = Context::new(&adapter, excluded)?;
         let kernels = Kernels::new(&context, options.deterministic)?;
-        Ok(Self { context, kernels, model: None, trainer: None, keyframes: Keyframes::default(), pairs: options.pairs })
+        Ok(Self {
+            context,
+            kernels,
+            model: None,
+            trainer: None,
+            keyframes: Keyframes::default(),
+            copying: None,
+            copy_staging: None,
+            taken_back: 0,
+            pairs: options.pairs,
+        })
     }
 
     /// Name of the adapter.
@@ -88,6 +104,8 @@ impl Engine {
             }
         }
         all.push(("keyframes", self.keyframes.bytes()));
+        let staging = self.copying.iter().map(Copying::bytes).chain(self.copy_staging.iter().map(Buffer::size));
+        all.push(("snapshots", staging.sum()));
         all
     }
 
@@ -169,6 +187,7 @@ impl Engine {
     ) -> Result<(), GpuError> {
         optimiser.fit(gaussians);
         statistics.fit(gaussians);
+        self.forget_copy();
         self.trainer = None;
         self.model = None;
         self.model = Some(DeviceModel::upload(&self.context, gaussians, Some((optimiser, statistics)))?);
@@ -351,10 +370,11 @@ impl Engine {
         Ok(())
     }
 
-    fn collect(&mut self, all: bool) -> Result<(), GpuError> {
+    pub(super) fn collect(&mut self, all: bool) -> Result<(), GpuError> {
         let Some(trainer) = &mut self.trainer else { return Ok(()) };
         let Some(pairs) = trainer.collect(&self.context, all)? else { return Ok(()) };
         let size = trainer.size();
+        self.taken_back += 1;
         self.make_room(pairs);
         self.replace_trainer(Size { capacity: self.pairs, ..size })
     }

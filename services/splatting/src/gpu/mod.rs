@@ -11,6 +11,7 @@ mod buffers;
 mod chain;
 mod check;
 mod context;
+mod copying;
 mod drawing;
 mod engine;
 mod error;

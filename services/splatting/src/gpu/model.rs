@@ -104,6 +104,18 @@ impl DeviceModel {
         Ok(Self { parameters, bands, gaussians, sh_degree, optimiser: state, bytes })
     }
 
+    /// Puts bytes of the two buffers into the model that was uploaded.
+    pub fn fill(&self, model: &mut Gaussians, parameters: &[u8], bands: &[u8]) {
+        let (blocks, rest) = model.parts_mut();
+        // Buffers are never empty, and longer than what they hold.
+        for (to, from) in blocks.iter_mut().zip(blocks_of(parameters)) {
+            *to = from;
+        }
+        for (to, from) in rest.iter_mut().zip(lanes_of(bands)) {
+            *to = from;
+        }
+    }
+
     /// Copies what training changed back.
     pub fn download(
         &self,
@@ -123,9 +135,7 @@ impl DeviceModel {
             (&device.steps, 4 * u64::from(self.gaussians)),
             (&device.statistics, STATISTICS_BYTES * blocks as u64),
         ])?;
-        let (model_blocks, model_rest) = model.parts_mut();
-        model_blocks.copy_from_slice(&blocks_of(&parameters));
-        model_rest.copy_from_slice(&lanes_of(&bands));
+        self.fill(model, &parameters, &bands);
         let (first, second) = state.split_at(block_bytes as usize);
         (optimiser.first, optimiser.second) = (blocks_of(first), blocks_of(second));
         let (first, second) = band_state.split_at(row_bytes as usize);

@@ -207,7 +207,8 @@ fn half_a_million_gaussians_and_48_keyframes_fit_420_mb() {
     let mut engine = Engine::new(&options).unwrap();
     let model = scene(500_000, 1);
     engine.upload(&model, &mut Optimiser::new(), &mut ScreenStatistics::new()).unwrap();
-    // Asked for and never run: what counts is what is allocated.
+    // With a snapshot on its way. The step is asked for and never run: what counts is what is allocated.
+    engine.begin_copy().unwrap();
     engine.step(&random_view(camera(320, 240), 1), &settings()).unwrap();
     let mut all = 0;
     for (what, bytes) in engine.bytes() {
@@ -243,4 +244,40 @@ fn views_of_different_sizes_take_turns() {
             assert!((gpu.total - cpu.total).abs() < 2e-3 * cpu.total, "{gpu:?} {cpu:?}");
         }
     });
+}
+
+/// A copy comes while training goes on, and is the model of the iterations that were asked for before it.
+#[test]
+fn a_copy_is_of_the_moment_it_was_begun() {
+    let test = "a_copy_is_of_the_moment_it_was_begun";
+    let Some(options) = options() else { return skipped(test) };
+    let (start, views) = task(200, (48, 40), 1);
+    // In order, so that runs repeat bit for bit.
+    let engine = |pairs| Engine::new(&Options { deterministic: true, pairs, ..options.clone() }).unwrap();
+    let (expected, ..) = on_gpu(&mut engine(0), &start, &views, 21);
+    let mut gpu = engine(0);
+    gpu.upload(&start, &mut Optimiser::new(), &mut ScreenStatistics::new()).unwrap();
+    let mut copy = start.clone();
+    assert!(!gpu.take_copy(&mut copy, true).unwrap(), "none was begun");
+    for i in 0..60 {
+        gpu.step(&views[i % views.len()], &settings()).unwrap();
+        if i == 5 {
+            // Forgotten for the next.
+            gpu.begin_copy().unwrap();
+        }
+        if i == 20 {
+            gpu.begin_copy().unwrap();
+        }
+    }
+    assert!(copy == start && gpu.take_copy(&mut copy, true).unwrap());
+    assert!(copy == expected, "of 21 iterations");
+    assert!(!gpu.take_copy(&mut copy, false).unwrap(), "it is taken once");
+    // Lists that do not fit: what was copied was not trained, so it is copied again.
+    let mut small = engine(40);
+    small.upload(&start, &mut Optimiser::new(), &mut ScreenStatistics::new()).unwrap();
+    for i in 0..21 {
+        small.step(&views[i % views.len()], &settings()).unwrap();
+    }
+    small.begin_copy().unwrap();
+    assert!(small.take_copy(&mut copy, true).unwrap() && copy == expected);
 }
