@@ -99,3 +99,30 @@ fn every_decision_is_in_the_journal_once_and_in_order() {
     let text = fs::read_to_string(folder.join("journal.jsonl")).expect("journal");
     assert!(!text.contains(folder.to_str().expect("utf8")), "no absolute path in the journal");
 }
+
+/// A GPU in software is taken where it is named, and flies the mission as the CPU does, in small images.
+#[test]
+fn a_mission_is_trained_and_scored_on_a_gpu() {
+    let Some(adapter) = splatting::gpu::adapters().into_iter().next() else {
+        assert!(std::env::var_os("VANTAGE_EXPECT_GPU").is_none(), "no GPU adapter, but one was expected");
+        println!("a_mission_is_trained_and_scored_on_a_gpu: skipped, no GPU adapter");
+        return;
+    };
+    let folder = tempfile::tempdir().expect("folder");
+    let folder = folder.path().join("mission");
+    let named = |service: &str| {
+        [format!("{service}.backend=\"gpu\""), format!("{service}.adapter=\"{}\"", adapter.name.replace('"', ""))]
+    };
+    let small = ["model.width=64", "model.height=48"].map(str::to_owned);
+    let sets: Vec<String> = [named("trainer"), named("scorer"), small].concat();
+    let mut arguments = vec!["--preset", "tiny", "--seed", "5"];
+    arguments.extend(sets.iter().flat_map(|set| ["--set", set]));
+    Flight::start(&folder, &arguments).finish_well();
+    assert_eq!(keyframes(&folder), (0..6).collect::<Vec<u64>>());
+    let metrics = metrics(&folder);
+    let backend = metrics["mission"]["backend"].as_str().expect("named");
+    assert!(backend.starts_with("gpu ") && backend.contains(&adapter.name), "{backend}");
+    assert!(metrics["memory"]["gpu_mb"].as_f64() > Some(0.1), "{metrics:#}");
+    let number = |name: &str| metrics["live"][name].as_f64().unwrap_or_else(|| panic!("live.{name} in {metrics:#}"));
+    assert!(number("psnr_object_db") > number("psnr_null_db") + 4.0, "{metrics:#}");
+}

@@ -3,6 +3,7 @@
 //! A GPU that fails takes the model on it along; the newest checkpoint stands. The trainer then ends, is started again, and
 //! tries the same back end once more; after that it trains on the CPU. `model/backend.json` remembers this.
 
+use std::collections::BTreeMap;
 use std::path::Path;
 
 use serde::{Deserialize, Serialize};
@@ -25,6 +26,8 @@ pub struct Record {
     pub failures: u32,
     /// How it failed last; empty where it did not.
     pub last_failure: String,
+    /// Most that was allocated on the GPU in a round, bytes by what for; nothing on the CPU.
+    pub gpu_bytes: BTreeMap<String, u64>,
 }
 
 impl Record {
@@ -33,6 +36,13 @@ impl Record {
     pub fn read(model_folder: &Path) -> Self {
         let text = std::fs::read_to_string(model_folder.join(FILE)).unwrap_or_default();
         serde_json::from_str(&text).unwrap_or_default()
+    }
+
+    /// Most that was allocated on the GPU in a round, megabytes; `None` on the CPU.
+    #[must_use]
+    pub fn gpu_mb(&self) -> Option<f64> {
+        let bytes: u64 = self.gpu_bytes.values().sum();
+        (bytes > 0).then(|| (bytes as f64 / 1e5).round() / 10.0)
     }
 
     fn write(&self, model_folder: &Path) {
@@ -83,6 +93,18 @@ pub(crate) fn record_failure(model_folder: &Path, error: &BackendError) {
     record.last_failure = error.to_string();
     tracing::error!(failures = record.failures, %error, "the back end failed; the newest checkpoint stands");
     record.write(model_folder);
+}
+
+/// Remembers, and tells, what is allocated on the GPU where it is more than before.
+pub(crate) fn record_memory(model_folder: &Path, backend: &Backend) {
+    let gpu_bytes: BTreeMap<String, u64> =
+        backend.gpu_bytes().into_iter().map(|(what, bytes)| (what.to_owned(), bytes)).collect();
+    let mut record = Record::read(model_folder);
+    if gpu_bytes.values().sum::<u64>() > record.gpu_bytes.values().sum() {
+        record.gpu_bytes = gpu_bytes;
+        tracing::info!(gpu_mb = record.gpu_mb(), bytes = ?record.gpu_bytes, "memory on the GPU");
+        record.write(model_folder);
+    }
 }
 
 #[cfg(test)]

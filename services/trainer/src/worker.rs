@@ -289,6 +289,7 @@ impl Thread {
             if !self.train()? {
                 return Err(End::Unwanted);
             }
+            backend::record_memory(&self.model_folder, self.session.backend());
             self.session.finish()?;
         }
         // On disk before anybody hears of it.

@@ -93,7 +93,9 @@ pub fn measure(
     }
     let gaussians = read_model(model.unwrap_or(&own))?;
     let mut metrics = Metrics::of_folder(config, &flight::read(folder)?, &journal::read(&folder.journal_path())?);
-    metrics.mission.backend = Some(Record::read(&folder.model_path()).backend).filter(|name| !name.is_empty());
+    let record = Record::read(&folder.model_path());
+    metrics.memory.extend(record.gpu_mb().map(|megabytes| ("gpu_mb".to_owned(), megabytes)));
+    metrics.mission.backend = Some(record.backend).filter(|name| !name.is_empty());
     metrics.live.gaussians = Some(gaussians.len());
     metrics.memory.insert("model_mb".to_owned(), model_mb(&gaussians));
     let poses = keyframe_poses(folder)?;
