@@ -66,6 +66,28 @@ fn a_mission_survives_the_keeper() {
     survives("keeper", 1);
 }
 
+/// One after the other, in the phases that a mission goes through.
+#[test]
+fn a_mission_survives_all_of_them() {
+    const KILLS: [(usize, &str); 7] =
+        [(0, "keeper"), (1, "camera"), (2, "px4-link"), (3, "world"), (4, "scorer"), (4, "trainer"), (5, "planner")];
+    let base = tempfile::tempdir().expect("folder");
+    let folder = base.path().join("mission");
+    let mut flight = Flight::start(&folder, &["--preset", "tiny", "--seed", "21"]);
+    for (after, service) in KILLS {
+        flight.wait_until(service, |flight| {
+            keyframes(&flight.folder).len() >= after && flight.services().contains_key(service)
+        });
+        if let Some(pid) = flight.services().get(service) {
+            kill(*pid, "KILL");
+        }
+    }
+    flight.finish_well();
+    for (_, service) in KILLS {
+        assert_complete(&folder, service, 1);
+    }
+}
+
 #[test]
 fn a_mission_survives_launch() {
     let base = tempfile::tempdir().expect("folder");

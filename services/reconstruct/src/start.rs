@@ -75,7 +75,7 @@ pub fn voxel_m(dataset: &Dataset, training: &[usize]) -> Option<f32> {
 pub fn origin(dataset: &Dataset, training: &[usize]) -> Origin {
     if voxel_m(dataset, training).is_some() {
         Origin::Depth
-    } else if dataset.points.len() >= LEAST_POINTS {
+    } else if places(&dataset.points, LEAST_POINTS) {
         Origin::Points
     } else {
         Origin::Random
@@ -170,6 +170,20 @@ fn insertion_rules(stage: &Stage) -> InsertionRules {
     }
 }
 
+/// Whether points lie at so many different places.
+fn places(points: &[crate::dataset::Point], count: usize) -> bool {
+    let mut found: Vec<DVec3> = Vec::with_capacity(count);
+    for point in points {
+        if !found.contains(&point.position) {
+            found.push(point.position);
+        }
+        if found.len() >= count {
+            return true;
+        }
+    }
+    false
+}
+
 fn from_points(
     dataset: &Dataset,
     images: &[&Image],
@@ -185,7 +199,8 @@ fn from_points(
     let stride = dataset.points.len().div_ceil(max_gaussians).max(1);
     let points: Vec<ColoredPoint> =
         dataset.points.iter().step_by(stride).map(colored).filter(|point| point.position.is_finite()).collect();
-    if points.len() >= LEAST_POINTS
+    if places(&dataset.points, LEAST_POINTS)
+        && points.len() >= LEAST_POINTS
         && let Ok(model) = how.from_points(&points)
     {
         return (model, Origin::Points);
@@ -253,6 +268,13 @@ mod tests {
         assert!(!seen(Vec3::new(3.0, 0.0, 1.0), 0.01), "beside");
         assert!(seen(Vec3::new(3.0, 0.0, 1.0), 1.0), "beside, and large enough");
         assert!(!is_seen(&Gaussians::new(), &[&image], 0.05));
+    }
+
+    #[test]
+    fn points_at_one_place_are_no_shape_to_begin_with() {
+        let at = |x: f64| crate::dataset::Point { position: DVec3::X * x, rgb: [1, 2, 3] };
+        assert!(!places(&vec![at(1.0); 1000], LEAST_POINTS) && !places(&[at(0.0), at(1.0), at(2.0)], LEAST_POINTS));
+        assert!(places(&[at(0.0), at(0.0), at(1.0), at(2.0), at(3.0)], LEAST_POINTS));
     }
 
     #[test]

@@ -5,6 +5,7 @@
 //! spherical-harmonics bands are rows of their own beside these, none at degree 0: live training uses degree 0 (degree 1
 //! brought nothing measurable), offline training up to 3.
 
+use bytemuck::{Pod, Zeroable};
 use glam::{Quat, Vec3};
 
 /// Gaussians per block, the width of every SIMD path.
@@ -36,12 +37,12 @@ pub(crate) const ROW_OPACITY: usize = 10;
 pub(crate) const ROW_SH: usize = 11;
 
 /// One parameter of 16 Gaussians, aligned for the widest vector register.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
 #[repr(C, align(64))]
 pub(crate) struct Lanes(pub [f32; LANES]);
 
 /// All parameters (or all moments of one order) of 16 Gaussians.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
 #[repr(C, align(64))]
 pub(crate) struct Block(pub [Lanes; ROWS]);
 

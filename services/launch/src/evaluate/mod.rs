@@ -157,9 +157,14 @@ pub fn read_model(path: &Path) -> anyhow::Result<Gaussians> {
         Refusal::failed(format!("{}: {error}; {way_out}", path.display()))
     })?;
     let format = Format::of_path(path).unwrap_or(Format::Ply);
-    splatting::formats::read(format, &bytes).map_err(|error| {
-        Refusal::failed(format!("{}: {error}; expected a whole model, such as model/rounds/*.ply", path.display()))
-    })
+    let refused = |why: &str| {
+        Refusal::failed(format!("{}: {why}; expected a whole model, such as model/rounds/*.ply", path.display()))
+    };
+    match splatting::formats::read(format, &bytes) {
+        Ok(model) if model.is_empty() => Err(refused("it holds no Gaussians")),
+        Ok(model) => Ok(model),
+        Err(error) => Err(refused(&error.to_string())),
+    }
 }
 
 /// `report/metrics.json` as text.

@@ -70,12 +70,8 @@ impl Context {
         let fault = Arc::new(Mutex::new(None));
         let first = Arc::clone(&fault);
         device.on_uncaptured_error(Arc::new(move |error| {
-            let found = match error {
-                wgpu::Error::OutOfMemory { source } => GpuError::OutOfMemory(source.to_string()),
-                other => GpuError::Refused(other.to_string()),
-            };
             // The first one is the cause.
-            first.lock().unwrap_or_else(PoisonError::into_inner).get_or_insert(found);
+            first.lock().unwrap_or_else(PoisonError::into_inner).get_or_insert(fault_of(error));
         }));
         let lost = Arc::clone(&fault);
         device.set_device_lost_callback(move |reason, message| {
@@ -161,6 +157,14 @@ impl Context {
     }
 }
 
+/// What an error that the device reports by itself is.
+fn fault_of(error: wgpu::Error) -> GpuError {
+    match error {
+        wgpu::Error::OutOfMemory { source } => GpuError::OutOfMemory(source.to_string()),
+        other => GpuError::Refused(other.to_string()),
+    }
+}
+
 /// A buffer on its way to the host.
 pub(super) struct Mapping {
     done: mpsc::Receiver<Result<(), wgpu::BufferAsyncError>>,
@@ -198,9 +202,24 @@ impl Mapping {
 /// Copies what a mapped buffer holds, and unmaps it.
 pub(super) fn copy(buffer: &Buffer, bytes: u64) -> Result<Vec<u8>, GpuError> {
     let copied = match buffer.get_mapped_range(..) {
-        Ok(view) => Ok(view.iter().take(bytes as usize).copied().collect()),
+        Ok(view) => Ok(view[..bytes as usize].to_vec()),
         Err(error) => Err(GpuError::Refused(error.to_string())),
     };
     buffer.unmap();
     copied
+}
+
+#[cfg(test)]
+mod unit_tests {
+    use super::*;
+
+    #[test]
+    fn a_full_memory_is_told_from_a_refusal() {
+        let source = || Box::new(std::io::Error::other("VK_ERROR_OUT_OF_DEVICE_MEMORY"));
+        let full = fault_of(wgpu::Error::OutOfMemory { source: source() });
+        assert!(full.to_string().contains("out of memory") && full.to_string().contains("DEVICE_MEMORY"), "{full}");
+        let description = "binding 3 is missing".to_owned();
+        let refused = fault_of(wgpu::Error::Validation { source: source(), description });
+        assert!(matches!(refused, GpuError::Refused(_)));
+    }
 }

@@ -1,12 +1,12 @@
 //! A model and its optimiser on the GPU: the same blocks of 16 Gaussians, byte for byte.
 
-use bytemuck::{cast_slice, pod_collect_to_vec};
+use bytemuck::{cast_slice, cast_slice_mut, pod_collect_to_vec};
 use wgpu::Buffer;
 
 use super::buffers::Bytes;
 use super::context::Context;
 use super::error::GpuError;
-use crate::model::{Block, Gaussians, LANES, Lanes, ROWS, sh_rest_rows};
+use crate::model::{Block, Gaussians, Lanes, sh_rest_rows};
 use crate::optimiser::Optimiser;
 use crate::statistics::{self, ScreenStatistics};
 
@@ -33,24 +33,6 @@ pub(super) struct DeviceOptimiser {
     /// As [`ScreenStatistics`] has them.
     pub statistics: Buffer,
     pub ids: Buffer,
-}
-
-fn rows_of(lanes: &[Lanes]) -> Vec<u8> {
-    lanes.iter().flat_map(|row| cast_slice::<f32, u8>(&row.0)).copied().collect()
-}
-
-fn rows_of_blocks(blocks: &[Block]) -> Vec<u8> {
-    blocks.iter().flat_map(|block| &block.0).flat_map(|row| cast_slice::<f32, u8>(&row.0)).copied().collect()
-}
-
-pub(super) fn lanes_of(bytes: &[u8]) -> Vec<Lanes> {
-    let values: Vec<f32> = pod_collect_to_vec(bytes);
-    values.as_chunks::<LANES>().0.iter().map(|&row| Lanes(row)).collect()
-}
-
-pub(super) fn blocks_of(bytes: &[u8]) -> Vec<Block> {
-    let rows = lanes_of(bytes);
-    rows.as_chunks::<ROWS>().0.iter().map(|&rows| Block(rows)).collect()
 }
 
 impl DeviceModel {
@@ -86,15 +68,15 @@ impl DeviceModel {
                 context.queue.write_buffer(buffer, offset, bytes);
             }
         };
-        write(&parameters, 0, &rows_of_blocks(model.blocks()));
-        write(&bands, 0, &rows_of(model.rest()));
+        write(&parameters, 0, cast_slice(model.blocks()));
+        write(&bands, 0, cast_slice(model.rest()));
         if let (Some(device), Some((host, statistics))) = (&state, training) {
-            write(&device.state, 0, &rows_of_blocks(&host.first));
-            write(&device.state, BLOCK_BYTES * blocks, &rows_of_blocks(&host.second));
-            write(&device.band_state, 0, &rows_of(&host.first_rest));
-            write(&device.band_state, LANES_BYTES * rows, &rows_of(&host.second_rest));
+            write(&device.state, 0, cast_slice(&host.first));
+            write(&device.state, BLOCK_BYTES * blocks, cast_slice(&host.second));
+            write(&device.band_state, 0, cast_slice(&host.first_rest));
+            write(&device.band_state, LANES_BYTES * rows, cast_slice(&host.second_rest));
             write(&device.steps, 0, cast_slice(&host.steps));
-            write(&device.statistics, 0, &rows_of(statistics.rows()));
+            write(&device.statistics, 0, cast_slice(statistics.rows()));
             write(&device.ids, 0, cast_slice(model.ids()));
         }
         // So that the copies do not wait in memory for the first iteration.
@@ -107,13 +89,10 @@ impl DeviceModel {
     /// Puts bytes of the two buffers into the model that was uploaded.
     pub fn fill(&self, model: &mut Gaussians, parameters: &[u8], bands: &[u8]) {
         let (blocks, rest) = model.parts_mut();
-        // Buffers are never empty, and longer than what they hold.
-        for (to, from) in blocks.iter_mut().zip(blocks_of(parameters)) {
-            *to = from;
-        }
-        for (to, from) in rest.iter_mut().zip(lanes_of(bands)) {
-            *to = from;
-        }
+        // Buffers are never empty, so they may be longer than what they hold.
+        let (blocks, rest) = (cast_slice_mut::<Block, u8>(blocks), cast_slice_mut::<Lanes, u8>(rest));
+        blocks.copy_from_slice(&parameters[..blocks.len()]);
+        rest.copy_from_slice(&bands[..rest.len()]);
     }
 
     /// Copies what training changed back.
@@ -137,13 +116,13 @@ impl DeviceModel {
         ])?;
         self.fill(model, &parameters, &bands);
         let (first, second) = state.split_at(block_bytes as usize);
-        (optimiser.first, optimiser.second) = (blocks_of(first), blocks_of(second));
+        (optimiser.first, optimiser.second) = (pod_collect_to_vec(first), pod_collect_to_vec(second));
         let (first, second) = band_state.split_at(row_bytes as usize);
-        (optimiser.first_rest, optimiser.second_rest) = (lanes_of(first), lanes_of(second));
+        (optimiser.first_rest, optimiser.second_rest) = (pod_collect_to_vec(first), pod_collect_to_vec(second));
         optimiser.sh_degree = self.sh_degree;
         optimiser.steps = pod_collect_to_vec(&steps);
         statistics.fit(model);
-        statistics.rows_mut().copy_from_slice(&lanes_of(&seen));
+        cast_slice_mut::<Lanes, u8>(statistics.rows_mut()).copy_from_slice(&seen);
         Ok(())
     }
 }
