@@ -217,6 +217,22 @@ fn claim_instance(config: &mut Config) -> anyhow::Result<Option<Claim>> {
     Ok(Some(claim))
 }
 
+/// Removes the systems of launches that were killed together with all their services.
+fn sweep_dead_systems() {
+    for system in System::list(&System::base_dir()) {
+        let launch = i32::try_from(system.supervisor_pid).ok().and_then(rustix::process::Pid::from_raw);
+        let runs = launch.is_some_and(|pid| rustix::process::test_kill_process(pid).is_ok());
+        if launch.is_none() || runs {
+            continue;
+        }
+        match system.remove_if_dead() {
+            Ok(true) => tracing::info!(system = %system.name, "removed what a launch that was killed left"),
+            Ok(false) => {}
+            Err(error) => tracing::warn!(%error, "a dead system could not be removed"),
+        }
+    }
+}
+
 /// A system that is removed when the run is over, however it ends; unless services of it still bring a vehicle home.
 struct Owned {
     system: System,
@@ -229,7 +245,7 @@ impl Drop for Owned {
         match self.system.remove_if_dead() {
             Ok(true) => {}
             Ok(false) => say(&format!(
-                "system {} is left to its services, which land the vehicle and end; `vantage doctor --clean` removes it then",
+                "system {} is left to its services, which land the vehicle, end and remove it",
                 self.system.name
             )),
             Err(error) => tracing::warn!(%error, "the system's folder could not be removed"),
@@ -251,6 +267,7 @@ fn mission(
             folder.root().display()
         )));
     }
+    sweep_dead_systems();
     let mut progress = Progress::new();
     let flight = {
         let (system, hold) = System::create_held(&System::base_dir(), system, std::process::id())?;

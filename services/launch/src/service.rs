@@ -32,7 +32,8 @@ pub fn run(name: ServiceName, arguments: &Service) -> anyhow::Result<()> {
     }
     shared_types::memory::give_back_freed_memory();
     apply_scheduling(name);
-    let (system, config, _made) = join(arguments)?;
+    let (system, config, made) = join(arguments)?;
+    let left_behind = arguments.supervised.then(|| system.clone());
     if system.version != env!("CARGO_PKG_VERSION") {
         return Err(Refusal::missing(format!(
             "system {} was made by Vantage {}, expected {}; stop it and start all services with one version",
@@ -47,7 +48,25 @@ pub fn run(name: ServiceName, arguments: &Service) -> anyhow::Result<()> {
     tracing::info!(service = %name, system = %context.system.name, pid = std::process::id(), "started");
     let result = dispatch(name, context, sweeping).with_context(|| format!("{name} cannot go on"));
     tracing::info!(service = %name, ok = result.is_ok(), "ended");
+    drop(made);
+    if let Some(system) = left_behind {
+        clean_up(&system);
+    }
     result
+}
+
+/// What launch does at the end, where it is gone: the last service to end removes the system.
+fn clean_up(system: &System) {
+    let parent = rustix::process::getppid().map_or(0, |pid| pid.as_raw_nonzero().get().unsigned_abs());
+    if system.supervisor_pid == 0 || system.supervisor_pid == parent {
+        return;
+    }
+    match system.remove_if_dead() {
+        Ok(true) => tracing::info!(system = %system.name, "removed what its supervisor left"),
+        // Others are still there, and see to it.
+        Ok(false) => {}
+        Err(error) => tracing::warn!(%error, "the system's folder could not be removed"),
+    }
 }
 
 /// How long a system may be in the making by another service that was started at the same time.
