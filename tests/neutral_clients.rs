@@ -11,21 +11,23 @@ use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
 use common::{kill, vantage};
+use shared_types::system::System;
 
 struct Simulator {
     child: Child,
+    name: &'static str,
     instance: u16,
 }
 
 impl Simulator {
     /// A vehicle alone, on the wall's clock.
-    fn start(name: &str, instance: u16) -> Self {
+    fn start(name: &'static str, instance: u16) -> Self {
         let mut command = vantage();
         command.args(["simulator", "--system", name, "--set", "clock.mode=wall"]);
         command.args(["--set", &format!("simulator.instance={instance}"), "--set", "simulator.start_m=[0.0, 0.0]"]);
         let child = command.stdin(Stdio::null()).stdout(Stdio::null()).spawn().expect("the simulator starts");
         std::thread::sleep(Duration::from_millis(500));
-        Self { child, instance }
+        Self { child, name, instance }
     }
 }
 
@@ -38,6 +40,10 @@ impl Drop for Simulator {
         }
         drop(self.child.kill());
         drop(self.child.wait());
+        // Made by hand, so nobody else removes it.
+        if let Ok(system) = System::find(&System::base_dir(), Some(self.name)) {
+            system.remove_if_dead().ok();
+        }
     }
 }
 

@@ -46,8 +46,8 @@ struct Options {
     /// Only this service is killed; default: any, and launch.
     #[arg(long)]
     service: Option<String>,
-    /// Longest wall time between two kills, milliseconds; the least is 0.
-    #[arg(long, default_value_t = 1500)]
+    /// Longest wall time of a kill behind the beginning of the phase that is drawn for it, milliseconds; the least is 0.
+    #[arg(long, default_value_t = 200)]
     pause_ms: u64,
     /// Where results go.
     #[arg(long, default_value = "target/faults")]

@@ -13,6 +13,8 @@ use crate::{Options, phase};
 const SERVICES: [&str; 8] = ["px4-link", "camera", "trainer", "scorer", "planner", "keeper", "world", "launch"];
 /// Longest wait for a new process, and for the services to end after launch.
 const PATIENCE: Duration = Duration::from_secs(60);
+/// Longest wait for a phase.
+const PHASE_PATIENCE: Duration = Duration::from_secs(5);
 /// Ids from here on are views of the prior, of which only the newest counts.
 const PRIOR_IDS: u64 = 1_000_000;
 
@@ -29,6 +31,7 @@ pub fn fly(options: &Options, index: u64) -> Flown {
     let mut error = String::new();
     for _ in 0..options.kills {
         let Some(flying) = flight.as_mut() else { break };
+        await_a_phase(flying, &folder, &mut random);
         std::thread::sleep(Duration::from_millis(u64::from(random.below(options.pause_ms.max(1) as u32))));
         let services = flying.services();
         let service = match &options.service {
@@ -81,6 +84,20 @@ pub fn fly(options: &Options, index: u64) -> Flown {
         drop(std::fs::remove_file(folder.with_extension("terminal.log")));
     }
     Flown { mission, faults }
+}
+
+/// Waits until the mission is in a phase that is drawn, so that short ones have their share; not for long, and not for one
+/// that is over.
+fn await_a_phase(flight: &Flight, folder: &Path, random: &mut Random) {
+    let aim = random.below(phase::PHASES.len() as u32) as usize;
+    let began = Instant::now();
+    while began.elapsed() < PHASE_PATIENCE && runs(flight.pid()) {
+        let now = phase::of(folder);
+        if now == phase::PHASES[aim] || now == "shutdown" {
+            break;
+        }
+        std::thread::sleep(Duration::from_millis(2));
+    }
 }
 
 /// Milliseconds until the service has another process.
