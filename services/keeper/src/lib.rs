@@ -133,6 +133,8 @@ impl Reaping {
         let (count, end) = (Arc::clone(&reaped), Arc::clone(&stop));
         let (system, limits) = (context.system.clone(), Limits::of(&context.config));
         let (name, incarnation) = (context.name, context.incarnation);
+        // What a dead service left in shared memory is looked at with a debugger.
+        let hold = context.config.launch.hold_on_fault;
         std::thread::Builder::new().name("reaper".to_owned()).spawn(move || {
             let bus = match Bus::open(&system, limits, name, incarnation, false) {
                 Ok(bus) => bus,
@@ -142,7 +144,9 @@ impl Reaping {
                 }
             };
             while !end.load(Ordering::Relaxed) {
-                count.fetch_add(bus.reap_the_dead(), Ordering::Relaxed);
+                if !hold {
+                    count.fetch_add(bus.reap_the_dead(), Ordering::Relaxed);
+                }
                 std::thread::sleep(REAPER_PERIOD);
             }
         })?;

@@ -28,6 +28,14 @@ fn state_of(stat: &str) -> Option<char> {
     stat.rsplit_once(") ")?.1.chars().next()
 }
 
+/// The process that traces a process, such as a debugger; `None` where there is none.
+#[must_use]
+pub fn tracer(pid: u32) -> Option<u32> {
+    let status = fs::read_to_string(format!("/proc/{pid}/status")).ok()?;
+    let line = status.lines().find_map(|line| line.strip_prefix("TracerPid:"))?;
+    line.trim().parse().ok().filter(|tracer| *tracer != 0)
+}
+
 /// Seconds since a process started; `None` when it is gone.
 #[must_use]
 pub fn age_s(pid: u32) -> Option<f64> {
@@ -70,6 +78,7 @@ mod tests {
         assert!(pss_bytes(pid).is_some_and(|bytes| bytes > 100_000));
         assert!(age_s(pid).is_some_and(|age| age < 3600.0));
         assert!(nice(pid).is_some());
+        assert_eq!(tracer(pid), None);
         assert_eq!(pss_of("00400000-7ffd rollup\nRss:  900 kB\nPss:  123 kB\n"), Some(123 * 1024));
     }
 

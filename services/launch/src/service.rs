@@ -42,6 +42,9 @@ pub fn run(name: ServiceName, arguments: &Service) -> anyhow::Result<()> {
             env!("CARGO_PKG_VERSION")
         )));
     }
+    if config.launch.hold_on_fault {
+        hold_panics();
+    }
     // Before the bus: joining it may wait for what only the keeper removes.
     let sweeping = if name == ServiceName::Keeper { Some(keeper::sweep(&system)?) } else { None };
     let context = Context::open(name, config, system, arguments.supervised)?;
@@ -53,6 +56,19 @@ pub fn run(name: ServiceName, arguments: &Service) -> anyhow::Result<()> {
         clean_up(&system);
     }
     result
+}
+
+/// From now on a panic stops this process where it is, for a debugger; SIGCONT lets it die.
+fn hold_panics() {
+    let tell = std::panic::take_hook();
+    std::panic::set_hook(Box::new(move |panic| {
+        tell(panic);
+        let pid = rustix::process::getpid();
+        tracing::error!(pid = pid.as_raw_nonzero().get(), "a panic is held for a debugger: `gdb -p PID`, then SIGCONT");
+        if let Err(error) = rustix::process::kill_process(pid, rustix::process::Signal::STOP) {
+            tracing::error!(%error, "this process cannot be stopped");
+        }
+    }));
 }
 
 /// What launch does at the end, where it is gone: the last service to end removes the system.

@@ -75,6 +75,8 @@ pub struct Scorer {
     transparent_alpha: f64,
     ms_per_candidate: f64,
     lockstep: bool,
+    /// The present tick waits for the thread.
+    awaited: bool,
 }
 
 impl From<WorkerGone> for ServiceError {
@@ -112,6 +114,7 @@ impl Scorer {
             transparent_alpha: config.scorer.transparent_alpha,
             ms_per_candidate,
             lockstep,
+            awaited: false,
         })
     }
 
@@ -206,10 +209,8 @@ impl Scorer {
         self.ports.reply(now_ns, to, &reply, &[])?;
         Ok(())
     }
-}
 
-impl Service for Scorer {
-    fn step(&mut self, now_ns: u64) -> Result<Step, ServiceError> {
+    fn turn(&mut self, now_ns: u64) -> Result<Step, ServiceError> {
         self.ports.receive_snapshots(now_ns, &mut self.holdings)?;
         while let Some(asked) = self.ports.receive_request(now_ns)? {
             self.take(now_ns, asked)?;
@@ -231,9 +232,21 @@ impl Service for Scorer {
             }
         }
     }
+}
+
+impl Service for Scorer {
+    fn step(&mut self, now_ns: u64) -> Result<Step, ServiceError> {
+        let step = self.turn(now_ns)?;
+        self.awaited = step == Step::Waiting;
+        Ok(step)
+    }
 
     fn work(&self) -> u64 {
         self.worker.work()
+    }
+
+    fn busy(&self) -> bool {
+        if self.lockstep { self.awaited } else { matches!(self.state, State::Scoring { .. }) }
     }
 
     fn rejoin(&mut self, now_ns: u64) {

@@ -63,6 +63,8 @@ pub struct Trainer {
     /// Infinite in wall mode: results are due when they are there.
     iterations_per_s: f64,
     lockstep: bool,
+    /// The present tick waits for the thread.
+    awaited: bool,
     snapshot_period_ns: u64,
     checkpoint_period_ns: u64,
     asked_snapshot_ns: u64,
@@ -119,6 +121,7 @@ impl Trainer {
             slice_iterations: config.trainer.slice_iterations,
             iterations_per_s,
             lockstep,
+            awaited: false,
             snapshot_period_ns: ns_from_s(config.trainer.snapshot_period_s),
             checkpoint_period_ns: ns_from_s(config.trainer.checkpoint_period_s),
             asked_snapshot_ns: 0,
@@ -311,11 +314,18 @@ impl Trainer {
 
 impl Service for Trainer {
     fn step(&mut self, now_ns: u64) -> Result<Step, ServiceError> {
-        self.turn(now_ns)
+        let step = self.turn(now_ns)?;
+        self.awaited = step == Step::Waiting;
+        Ok(step)
     }
 
     fn work(&self) -> u64 {
         self.worker.work()
+    }
+
+    /// In lockstep the thread runs ahead of the clock and then waits for it: only what is awaited is in work for certain.
+    fn busy(&self) -> bool {
+        if self.lockstep { self.awaited } else { matches!(self.state, State::Starting | State::Training(_)) }
     }
 
     fn rejoin(&mut self, now_ns: u64) {

@@ -20,6 +20,14 @@ pub struct LaunchConfig {
     pub stop_timeout_s: f64,
     /// Time that a mission gets to return, land and save after the first Ctrl-C, seconds.
     pub landing_timeout_s: f64,
+    /// A service that says nothing for so long is hung: it is killed and started again, seconds.
+    pub watchdog_s: f64,
+    /// The same for its first word after its start, seconds: large scenes and checkpoints take their time.
+    pub watchdog_start_s: f64,
+    /// A service whose worker has a job and makes no progress for so long is hung, seconds.
+    pub watchdog_work_s: f64,
+    /// A service that died or hangs is left as it is for a debugger, instead of being started again.
+    pub hold_on_fault: bool,
     /// Time between two measurements of memory (PSS), seconds; 0: none.
     pub memory_period_s: f64,
     /// Log level of the services' log files: error, warn, info, debug or trace.
@@ -37,6 +45,10 @@ impl Default for LaunchConfig {
             crash_window_s: 30.0,
             stop_timeout_s: 10.0,
             landing_timeout_s: 180.0,
+            watchdog_s: 10.0,
+            watchdog_start_s: 60.0,
+            watchdog_work_s: 120.0,
+            hold_on_fault: false,
             memory_period_s: 2.0,
             log_level: "info".to_owned(),
             evaluate_views: 100,
@@ -58,6 +70,9 @@ impl Section for LaunchConfig {
             Problem::unless_within("crash_window_s", self.crash_window_s, 1.0, 3600.0),
             Problem::unless_within("stop_timeout_s", self.stop_timeout_s, 0.1, 600.0),
             Problem::unless_within("landing_timeout_s", self.landing_timeout_s, 1.0, 3600.0),
+            Problem::unless_within("watchdog_s", self.watchdog_s, 3.0, 3600.0),
+            Problem::unless_within("watchdog_start_s", self.watchdog_start_s, self.watchdog_s.max(0.0), 3600.0),
+            Problem::unless_within("watchdog_work_s", self.watchdog_work_s, self.watchdog_s.max(0.0), 3600.0),
             Problem::unless_within("memory_period_s", self.memory_period_s, 0.0, 3600.0),
             Problem::unless_within("evaluate_views", f64::from(self.evaluate_views), 2.0, 1000.0),
         ]

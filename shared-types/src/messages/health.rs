@@ -20,7 +20,7 @@ codes! {
 
 payload! {
     /// `health` and `health/last`: once a second from every service.
-    pub struct Health [240] {
+    pub struct Health [248] {
         /// Which life of the service this is (its start, monotonic nanoseconds).
         pub incarnation: u64,
         /// Turns of the work loop.
@@ -29,6 +29,8 @@ payload! {
         pub turn_p50_ns: u64,
         /// 99th percentile of that, nanoseconds.
         pub turn_p99_ns: u64,
+        /// For how long a worker has had a job without progress, nanoseconds of wall time; 0 where none has, or it goes on.
+        pub stalled_ns: u64,
         /// Resident memory, bytes.
         pub rss_bytes: u64,
         /// Messages received.

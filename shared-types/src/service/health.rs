@@ -38,6 +38,24 @@ pub(super) struct HealthSender {
     last_ns: u64,
     turns: u64,
     turn_ns: Vec<u64>,
+    worked: Worked,
+}
+
+/// When a worker was last seen to get on.
+#[derive(Debug, Default)]
+struct Worked {
+    work: u64,
+    at_ns: u64,
+}
+
+impl Worked {
+    /// For how long the job in work has made no progress.
+    fn stalled_ns(&mut self, busy: bool, work: u64, wall_ns: u64) -> u64 {
+        if !busy || work != self.work || self.at_ns == 0 {
+            *self = Self { work, at_ns: wall_ns };
+        }
+        wall_ns.saturating_sub(self.at_ns)
+    }
 }
 
 impl HealthSender {
@@ -47,6 +65,7 @@ impl HealthSender {
             last_ns: 0,
             turns: 0,
             turn_ns: Vec::with_capacity(LONGEST_SAMPLE),
+            worked: Worked::default(),
         })
     }
 
@@ -79,6 +98,7 @@ impl HealthSender {
             turns: self.turns,
             turn_p50_ns: quantile(50),
             turn_p99_ns: quantile(99),
+            stalled_ns: self.worked.stalled_ns(service.busy(), service.work(), wall_ns),
             rss_bytes: resident_bytes(),
             received: report.received,
             sent: report.sent,
@@ -103,4 +123,19 @@ fn resident_bytes() -> u64 {
         .ok()
         .and_then(|text| text.split_whitespace().nth(1)?.parse::<u64>().ok())
         .map_or(0, |pages| pages * rustix::param::page_size() as u64)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_a_job_without_progress_is_stalled() {
+        let mut worked = Worked::default();
+        assert_eq!(worked.stalled_ns(true, 0, 5), 0, "it was just seen first");
+        assert_eq!(worked.stalled_ns(true, 0, 9), 4);
+        assert_eq!(worked.stalled_ns(true, 1, 12), 0, "it got on");
+        assert_eq!(worked.stalled_ns(false, 1, 20), 0, "nothing to do");
+        assert_eq!(worked.stalled_ns(true, 1, 25), 5, "a job since the last look, at the earliest");
+    }
 }

@@ -117,6 +117,11 @@ pub trait Service {
         0
     }
 
+    /// Whether a worker has a job, so that [`Service::work`] must grow. One that does not for long is taken for hung.
+    fn busy(&self) -> bool {
+        false
+    }
+
     /// Wall mode: time between turns.
     fn period(&self) -> Duration {
         Duration::from_millis(20)

@@ -10,6 +10,8 @@ use std::process::{Child, Command, ExitStatus, Stdio};
 use rustix::process::{Pid, Signal, kill_process};
 use shared_types::ServiceName;
 
+use super::autopsy;
+
 /// How children are started.
 #[derive(Debug, Clone)]
 pub struct Starter {
@@ -58,13 +60,15 @@ pub struct Children {
     starter: Starter,
     running: BTreeMap<ServiceName, Child>,
     in_the_air: bool,
+    /// Reports of hung services so far.
+    examined: u32,
 }
 
 impl Children {
     /// None yet.
     #[must_use]
     pub fn new(starter: Starter) -> Self {
-        Self { starter, running: BTreeMap::new(), in_the_air: false }
+        Self { starter, running: BTreeMap::new(), in_the_air: false, examined: 0 }
     }
 
     /// Starts a service.
@@ -86,6 +90,23 @@ impl Children {
     #[must_use]
     pub fn pids(&self) -> Vec<(ServiceName, u32)> {
         self.running.iter().map(|(service, child)| (*service, child.id())).collect()
+    }
+
+    /// The process id of a service that runs.
+    #[must_use]
+    pub fn pid(&self, service: ServiceName) -> Option<u32> {
+        self.running.get(&service).map(Child::id)
+    }
+
+    /// Writes down what a hung service's threads are doing, beside this thread, then kills it where `kill`. Gives the
+    /// report's path.
+    pub fn examine(&mut self, service: ServiceName, kill: bool) -> PathBuf {
+        self.examined += 1;
+        let path = self.starter.logs.join(format!("{service}-hung-{}.txt", self.examined));
+        if let Some(pid) = self.pid(service) {
+            autopsy::begin(service, pid, path.clone(), kill);
+        }
+        path
     }
 
     /// Those that ended since the last call, with their exit code (`None`: by a signal).

@@ -3,14 +3,17 @@
 //! Phases: *Starting* (keeper first, then the rest) -> *Flying* (the dead are started again with a back-off) ->
 //! *Returning* (the first Ctrl-C, or a service that cannot be kept alive: the mission is told to return, land and save)
 //! -> *Stopping* (group by group) -> *Over*. A second Ctrl-C kills at once. Before the motors ever ran there is nothing to
-//! bring home: then the first Ctrl-C, and a service that cannot be kept alive, go to *Stopping* directly.
+//! bring home: then the first Ctrl-C, and a service that cannot be kept alive, go to *Stopping* directly. Who hangs is
+//! killed and so mended like the dead ([`watch`]).
 
+mod watch;
 mod words;
 
 use std::collections::BTreeMap;
 
 use shared_types::ServiceName;
 
+use watch::Life;
 pub use words::{Action, Event, Outcome, Policy};
 
 use super::plan::{START_ORDER, STOP_GROUPS};
@@ -19,7 +22,11 @@ use super::plan::{START_ORDER, STOP_GROUPS};
 enum Member {
     NotStarted,
     Running,
-    Waiting { until_ms: u64 },
+    Waiting {
+        until_ms: u64,
+    },
+    /// Dead, and left as it is for a debugger.
+    Held,
     Gone,
 }
 
@@ -48,6 +55,7 @@ struct Record {
     deaths_ms: Vec<u64>,
     restarts: u32,
     heard: bool,
+    life: Life,
 }
 
 /// The state machine.
@@ -62,6 +70,8 @@ pub struct Supervisor {
     interrupts: u32,
     armed: bool,
     ever_armed: bool,
+    /// When the last event came.
+    stepped_ms: u64,
 }
 
 impl Supervisor {
@@ -69,7 +79,13 @@ impl Supervisor {
     #[must_use]
     pub fn new(policy: Policy, services: &[ServiceName]) -> Self {
         let services: Vec<ServiceName> = START_ORDER.into_iter().filter(|service| services.contains(service)).collect();
-        let record = Record { member: Member::NotStarted, deaths_ms: Vec::new(), restarts: 0, heard: false };
+        let record = Record {
+            member: Member::NotStarted,
+            deaths_ms: Vec::new(),
+            restarts: 0,
+            heard: false,
+            life: Life::default(),
+        };
         let members = services.iter().map(|service| (*service, record.clone())).collect();
         Self {
             policy,
@@ -80,6 +96,7 @@ impl Supervisor {
             interrupts: 0,
             armed: false,
             ever_armed: false,
+            stepped_ms: 0,
         }
     }
 
@@ -98,10 +115,13 @@ impl Supervisor {
     /// One event at a time of the wall's monotonic clock, milliseconds.
     pub fn step(&mut self, now_ms: u64, event: &Event) -> Vec<Action> {
         let mut actions = Vec::new();
+        self.forgive_a_gap(now_ms);
         match event {
             Event::Begin => self.begin(now_ms, &mut actions),
             Event::Tick => {}
-            Event::Heard(service) => self.heard(*service, &mut actions),
+            Event::Heard(service) => self.heard(now_ms, *service, &mut actions),
+            Event::Debugged(service) => self.debugged(now_ms, *service),
+            Event::Stalled(service, for_ms) => self.stalled(*service, *for_ms, &mut actions),
             Event::Exited { service, code } => self.exited(now_ms, *service, *code, &mut actions),
             Event::Interrupt => self.interrupt(now_ms, &mut actions),
             Event::MissionOver { usable } => {
@@ -131,33 +151,35 @@ impl Supervisor {
     fn begin(&mut self, now_ms: u64, actions: &mut Vec<Action>) {
         self.phase = Phase::Starting { since_ms: now_ms };
         match self.services.first().copied() {
-            Some(first) => self.start(first, actions),
+            Some(first) => self.start(now_ms, first, actions),
             None => self.finish(actions),
         }
     }
 
-    fn start(&mut self, service: ServiceName, actions: &mut Vec<Action>) {
+    fn start(&mut self, now_ms: u64, service: ServiceName, actions: &mut Vec<Action>) {
         if let Some(record) = self.members.get_mut(&service) {
             record.member = Member::Running;
+            record.life = Life::born(now_ms);
             actions.push(Action::Start(service));
         }
     }
 
-    fn start_the_rest(&mut self, actions: &mut Vec<Action>) {
+    fn start_the_rest(&mut self, now_ms: u64, actions: &mut Vec<Action>) {
         self.phase = Phase::Flying;
         for service in self.services.clone() {
             if self.member(service) == Some(Member::NotStarted) {
-                self.start(service, actions);
+                self.start(now_ms, service, actions);
             }
         }
     }
 
-    fn heard(&mut self, service: ServiceName, actions: &mut Vec<Action>) {
+    fn heard(&mut self, now_ms: u64, service: ServiceName, actions: &mut Vec<Action>) {
         if let Some(record) = self.members.get_mut(&service) {
             record.heard = true;
+            record.life.heard(now_ms);
         }
         if matches!(self.phase, Phase::Starting { .. }) && self.services.first() == Some(&service) {
-            self.start_the_rest(actions);
+            self.start_the_rest(now_ms, actions);
         }
     }
 
@@ -181,6 +203,12 @@ impl Supervisor {
             record.member = Member::Gone;
             self.outcome.get_or_insert(Outcome::Broken { service, code, worked: heard && !refuses });
             self.stop_group(now_ms, 0, vehicle_lost, actions);
+        } else if self.policy.hold_on_fault {
+            record.member = Member::Held;
+            actions.push(Action::Say(format!(
+                "{service} died and is left as it is (launch.hold_on_fault); start it again by hand with \
+                 `vantage {service} --system NAME`, or end with Ctrl-C"
+            )));
         } else if deaths > limit {
             record.member = Member::Gone;
             self.outcome.get_or_insert(Outcome::Broken { service, code, worked: heard });
@@ -297,7 +325,7 @@ impl Supervisor {
                 let Some(record) = self.members.get_mut(&service) else { continue };
                 if matches!(record.member, Member::Waiting { until_ms } if now_ms >= until_ms) {
                     record.restarts += 1;
-                    self.start(service, actions);
+                    self.start(now_ms, service, actions);
                     if service == ServiceName::Planner && matches!(self.phase, Phase::Returning { recalled: true, .. })
                     {
                         // A recall is in no journal: a planner that was started anew does not know of it.
@@ -306,9 +334,10 @@ impl Supervisor {
                 }
             }
         }
+        self.watch(now_ms, actions);
         match self.phase {
             Phase::Starting { since_ms } if now_ms >= since_ms + self.policy.keeper_timeout_ms => {
-                self.start_the_rest(actions);
+                self.start_the_rest(now_ms, actions);
             }
             Phase::Returning { since_ms, .. } if now_ms >= since_ms + self.policy.landing_timeout_ms => {
                 self.outcome.get_or_insert(Outcome::NotLanded);

@@ -3,6 +3,7 @@
 //! [`machine`] decides and knows no process and no clock; [`children`] are the processes; [`ports`] is all its IPC;
 //! [`run`] is the loop that ties them together.
 
+mod autopsy;
 pub mod children;
 pub mod machine;
 pub mod memory;

@@ -15,11 +15,20 @@ use shared_types::system::System;
 
 use crate::clock::monotonic_ns;
 
+/// A service's health, as far as its supervisor needs it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Word {
+    /// Who.
+    pub service: ServiceName,
+    /// For how long its worker has had a job without progress, milliseconds.
+    pub stalled_ms: u64,
+}
+
 /// What was heard in one turn.
 #[derive(Debug, Default)]
 pub struct Heard {
     /// Services whose health came.
-    pub services: Vec<ServiceName>,
+    pub services: Vec<Word>,
     /// States of the mission, oldest first, with their stamps.
     pub missions: Vec<(u64, MissionState)>,
     /// The newest state of the vehicle.
@@ -91,7 +100,9 @@ impl Ports {
         let mut heard = Heard::default();
         let now_ns = self.now_ns();
         while let Some(message) = self.health.receive(now_ns)? {
-            heard.services.extend(ServiceName::from_code(message.header().service));
+            let health = message.header();
+            let word = |service| Word { service, stalled_ms: health.stalled_ns / 1_000_000 };
+            heard.services.extend(ServiceName::from_code(health.service).map(word));
         }
         while let Some(message) = self.missions.receive(now_ns)? {
             heard.missions.push((message.stamp_ns(), *message.header()));

@@ -60,6 +60,10 @@ fn policy(config: &Config) -> Policy {
         stop_timeout_ms: ms(config.launch.stop_timeout_s),
         landing_timeout_ms: ms(config.launch.landing_timeout_s),
         keeper_timeout_ms: 3_000,
+        silence_ms: ms(config.launch.watchdog_s),
+        start_ms: ms(config.launch.watchdog_start_s),
+        stall_ms: ms(config.launch.watchdog_work_s),
+        hold_on_fault: config.launch.hold_on_fault,
     }
 }
 
@@ -145,8 +149,11 @@ struct Run<'a> {
 impl Run<'_> {
     fn turn(&mut self, config: &Config) -> anyhow::Result<()> {
         let heard = self.ports.receive()?;
-        for service in heard.services {
-            self.event(&Event::Heard(service));
+        for word in heard.services {
+            self.event(&Event::Heard(word.service));
+            if word.stalled_ms > 0 {
+                self.event(&Event::Stalled(word.service, word.stalled_ms));
+            }
         }
         for (stamp_ns, state) in heard.missions {
             self.mission(stamp_ns, &state);
@@ -220,6 +227,7 @@ impl Run<'_> {
                 }
                 Action::Ask(service) => self.children.ask(service),
                 Action::Kill(service) => self.children.kill(service),
+                Action::Examine { service, kill } => self.examine(service, kill),
                 Action::CommandStop => warn_if_lost(self.ports.command_mission(MissionCommand::Stop)),
                 Action::CommandRecall => warn_if_lost(self.ports.command_mission(MissionCommand::Recall)),
                 Action::VehicleHold => {
@@ -229,6 +237,17 @@ impl Run<'_> {
                 Action::Say(text) => self.progress.say(&text),
                 Action::Finish(outcome) => self.outcome = Some(outcome),
             }
+        }
+    }
+
+    fn examine(&mut self, service: ServiceName, kill: bool) {
+        let Some(pid) = self.children.pid(service) else { return };
+        if proc::tracer(pid).is_some() {
+            self.progress.say(&format!("a debugger holds {service} (pid {pid}): waiting for it"));
+            self.event(&Event::Debugged(service));
+        } else {
+            let report = self.children.examine(service, kill);
+            self.progress.say(&format!("what {service} (pid {pid}) was doing: {}", report.display()));
         }
     }
 

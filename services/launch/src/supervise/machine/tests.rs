@@ -9,6 +9,10 @@ const POLICY: Policy = Policy {
     stop_timeout_ms: 500,
     landing_timeout_ms: 60_000,
     keeper_timeout_ms: 2_000,
+    silence_ms: 10_000,
+    start_ms: 60_000,
+    stall_ms: 120_000,
+    hold_on_fault: false,
 };
 
 fn flying() -> Supervisor {
@@ -265,10 +269,91 @@ fn who_does_not_stop_is_killed_but_px4_link_gets_the_time_to_fly_home() {
     assert!(supervisor.step(1_550 + 60_000, &Event::Tick).contains(&Action::Kill(Px4Link)));
 }
 
+fn examined(actions: &[Action]) -> Vec<(ServiceName, bool)> {
+    let examine = |action: &Action| match action {
+        Action::Examine { service, kill } => Some((*service, *kill)),
+        _ => None,
+    };
+    actions.iter().filter_map(examine).collect()
+}
+
+/// Everybody but `silent` speaks each second from `from_ms` until `to_ms`; gives what is done about it.
+fn speak(supervisor: &mut Supervisor, silent: ServiceName, from_ms: u64, to_ms: u64) -> Vec<Action> {
+    let mut actions = Vec::new();
+    for now_ms in (from_ms..to_ms).step_by(500) {
+        for service in START_ORDER.into_iter().filter(|service| *service != silent) {
+            actions.extend(supervisor.step(now_ms, &Event::Heard(service)));
+        }
+    }
+    actions
+}
+
+#[test]
+fn who_is_silent_is_killed_once_and_mended_like_the_dead() {
+    let mut supervisor = flying();
+    assert_eq!(examined(&speak(&mut supervisor, Camera, 500, 10_000)), []);
+    let actions = speak(&mut supervisor, Camera, 10_000, 14_000);
+    assert_eq!(examined(&actions), [(Camera, true)]);
+    assert!(
+        actions.contains(&Action::Say("camera has said nothing for 10 s: it is killed and started again".to_owned()))
+    );
+    assert!(supervisor.step(14_000, &exit(Camera, None)).is_empty());
+    assert_eq!(supervisor.step(14_100, &Event::Tick), [Action::Start(Camera)]);
+    // A new process has the time of a start.
+    assert_eq!(examined(&speak(&mut supervisor, Camera, 14_500, 74_000)), []);
+    assert_eq!(examined(&speak(&mut supervisor, Camera, 74_000, 75_000)), [(Camera, true)]);
+}
+
+#[test]
+fn a_job_without_progress_is_a_hang() {
+    let mut supervisor = flying();
+    assert_eq!(examined(&supervisor.step(500, &Event::Stalled(Trainer, 119_999))), []);
+    assert_eq!(examined(&supervisor.step(600, &Event::Stalled(Trainer, 120_000))), [(Trainer, true)]);
+    assert_eq!(examined(&supervisor.step(700, &Event::Stalled(Trainer, 121_000))), [], "once");
+}
+
+#[test]
+fn a_supervisor_that_was_stopped_blames_nobody_for_it() {
+    let mut supervisor = flying();
+    speak(&mut supervisor, Planner, 500, 6_000);
+    assert_eq!(examined(&supervisor.step(60_000, &Event::Tick)), []);
+    // The silence of before still counts.
+    assert_eq!(examined(&speak(&mut supervisor, Planner, 60_000, 64_000)), []);
+    assert_eq!(examined(&speak(&mut supervisor, Planner, 64_000, 65_500)), [(Planner, true)]);
+}
+
+#[test]
+fn a_service_in_a_debugger_may_be_silent() {
+    let mut supervisor = flying();
+    assert_eq!(examined(&speak(&mut supervisor, Scorer, 500, 11_000)), [(Scorer, true)]);
+    assert!(supervisor.step(11_000, &Event::Debugged(Scorer)).is_empty());
+    assert_eq!(examined(&speak(&mut supervisor, Scorer, 11_100, 21_000)), []);
+    assert_eq!(examined(&speak(&mut supervisor, Scorer, 21_000, 22_500)), [(Scorer, true)]);
+}
+
+#[test]
+fn faults_are_held_for_a_debugger_where_that_was_asked_for() {
+    let mut supervisor = Supervisor::new(Policy { hold_on_fault: true, ..POLICY }, &START_ORDER);
+    supervisor.step(0, &Event::Begin);
+    for service in START_ORDER {
+        supervisor.step(20, &Event::Heard(service));
+    }
+    supervisor.step(30, &Event::Armed);
+    let said = supervisor.step(100, &exit(Trainer, None));
+    assert!(matches!(&said[..], [Action::Say(text)] if text.contains("vantage trainer")), "{said:?}");
+    let actions = speak(&mut supervisor, Camera, 500, 12_000);
+    assert_eq!(examined(&actions), [(Camera, false)]);
+    assert!(!actions.contains(&Action::Start(Trainer)) && !supervisor.is_ending(), "{actions:?}");
+    // The user's interrupt ends it as ever.
+    assert!(supervisor.step(12_000, &Event::Interrupt).contains(&Action::CommandStop));
+    let actions = supervisor.step(13_000, &Event::MissionOver { usable: true });
+    assert_eq!(run_out(&mut supervisor, 13_000, actions).1, Outcome::Done);
+}
+
 proptest::proptest! {
     /// Whatever happens in whatever order, no service runs twice, and a run that is interrupted often enough ends.
     #[test]
-    fn nothing_runs_twice_and_every_run_can_be_ended(script in proptest::collection::vec((0_u8..7, 0_usize..8, 0_u64..800), 0..120)) {
+    fn nothing_runs_twice_and_every_run_can_be_ended(script in proptest::collection::vec((0_u8..9, 0_usize..8, 0_u64..800), 0..120)) {
         let mut supervisor = Supervisor::new(POLICY, &START_ORDER);
         let mut alive: std::collections::BTreeSet<ServiceName> = std::collections::BTreeSet::new();
         let mut over = false;
@@ -282,6 +367,8 @@ proptest::proptest! {
                 3 => Event::Disarmed,
                 4 => Event::Tick,
                 5 => Event::Armed,
+                6 => Event::Stalled(service, wait * 1_000),
+                7 => Event::Debugged(service),
                 _ => exit(service, None),
             });
         }
@@ -301,7 +388,7 @@ proptest::proptest! {
                         Action::Start(service) => {
                             proptest::prop_assert!(!over && alive.insert(service), "{service} runs twice or after the end");
                         }
-                        Action::Kill(service) if alive.remove(&service) => {
+                        Action::Kill(service) | Action::Examine { service, kill: true } if alive.remove(&service) => {
                             next.extend(supervisor.step(now, &exit(service, None)));
                         }
                         Action::Finish(_) => over = true,

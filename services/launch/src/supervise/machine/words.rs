@@ -19,6 +19,14 @@ pub struct Policy {
     pub landing_timeout_ms: u64,
     /// Time that the keeper gets before the others are started without a word from it.
     pub keeper_timeout_ms: u64,
+    /// A service that says nothing for so long is hung.
+    pub silence_ms: u64,
+    /// The same before its first word.
+    pub start_ms: u64,
+    /// A worker that has a job and makes no progress for so long is hung.
+    pub stall_ms: u64,
+    /// What died or hangs is left for a debugger.
+    pub hold_on_fault: bool,
 }
 
 /// What happened.
@@ -30,6 +38,10 @@ pub enum Event {
     Tick,
     /// The service's health was heard.
     Heard(ServiceName),
+    /// A worker of the service has had a job for so long without progress, milliseconds.
+    Stalled(ServiceName, u64),
+    /// A debugger has stopped the service: it may be silent.
+    Debugged(ServiceName),
     /// The process ended.
     Exited {
         /// Which one.
@@ -59,6 +71,13 @@ pub enum Action {
     Ask(ServiceName),
     /// Kill the process.
     Kill(ServiceName),
+    /// The process hangs: write down what its threads are doing, and kill it unless it is to be held.
+    Examine {
+        /// Which one.
+        service: ServiceName,
+        /// Whether to kill it then.
+        kill: bool,
+    },
     /// Tell the planner to return, land and save: the mission ends.
     CommandStop,
     /// Tell the planner to return and land, and to leave the mission open for `resume`.
