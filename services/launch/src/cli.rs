@@ -29,6 +29,18 @@ pub enum Command {
     /// Show what runs, since when, restarts, memory and ages of the last messages.
     #[command(after_help = "Example: vantage status --json")]
     Status(Status),
+    /// Tell a flying mission to return, land and save.
+    #[command(after_help = "Example: vantage stop --system fly-4711")]
+    Stop(Order),
+    /// Tell a flying mission to land where it is, and save.
+    #[command(after_help = "Example: vantage land")]
+    Land(Order),
+    /// Tell a flying mission to hold where it is until `vantage go-on`, `stop` or `land`.
+    #[command(after_help = "Example: vantage abort")]
+    Abort(Order),
+    /// Let a mission go on that waits: after a pilot has given the vehicle back, or after `vantage abort`.
+    #[command(after_help = "Example: vantage go-on")]
+    GoOn(Order),
     /// Check this machine and say what to do about what is found.
     #[command(after_help = "Example: vantage doctor --clean")]
     Doctor(Doctor),
@@ -158,6 +170,14 @@ pub struct Status {
     /// As JSON.
     #[arg(long)]
     pub json: bool,
+}
+
+/// Arguments of the operator's orders.
+#[derive(Debug, Clone, Args)]
+pub struct Order {
+    /// Name or folder of the system; default: the only one there is.
+    #[arg(long, value_name = "NAME")]
+    pub system: Option<String>,
 }
 
 /// Arguments of `doctor`.

@@ -5,7 +5,7 @@
 //! - [`fly`], [`supervise`], [`progress`], [`summary`]: a whole mission;
 //! - [`evaluate`], [`export`]: what a mission folder is worth, and how it leaves Vantage;
 //! - [`reconstruct`]: offline training on a mission folder or another dataset;
-//! - [`status`], [`doctor`]: what runs, and whether this machine is fit for it.
+//! - [`status`], [`order`], [`doctor`]: what runs, the operator's word to it, and whether this machine is fit for it.
 
 #![forbid(unsafe_code)]
 
@@ -18,6 +18,7 @@ pub mod export;
 pub mod fly;
 pub mod instance;
 pub mod machine_check;
+pub mod order;
 pub mod proc;
 pub mod progress;
 pub mod reconstruct;
@@ -36,6 +37,7 @@ use tracing_subscriber::filter::LevelFilter;
 use cli::{Cli, Command};
 use exit::{Exit, exit_of};
 use shared_types::folder::MissionFolder;
+use shared_types::messages::MissionCommand;
 
 /// The whole command: parses the arguments, does what they say, and tells how it went.
 #[must_use]
@@ -82,6 +84,10 @@ fn run(command: &Command) -> anyhow::Result<Exit> {
         Command::Fly(arguments) => fly::fly(arguments),
         Command::Resume(arguments) => fly::resume(arguments),
         Command::Status(arguments) => status::run(arguments),
+        Command::Stop(arguments) => order::run(MissionCommand::Stop, arguments),
+        Command::Land(arguments) => order::run(MissionCommand::Land, arguments),
+        Command::Abort(arguments) => order::run(MissionCommand::Abort, arguments),
+        Command::GoOn(arguments) => order::run(MissionCommand::GoOn, arguments),
         Command::Doctor(arguments) => doctor::run(arguments),
         Command::Evaluate(arguments) => evaluate::run(arguments),
         Command::Export(arguments) => export_any(arguments),
