@@ -42,6 +42,11 @@ impl Battery {
         self.remaining
     }
 
+    /// Its charge is another from one moment to the next, as when a cell fails.
+    pub fn set(&mut self, remaining: f64) {
+        *self = Self::new(remaining);
+    }
+
     /// Drains for `dt_s`: SIM_BAT_DRAIN is the time of flight from full to empty, SIM_BAT_MIN_PCT where it stops.
     pub fn step(&mut self, dt_s: f64, armed: bool, flying: bool, params: &Params) {
         let drain_s = params.real(Param::SIM_BAT_DRAIN);

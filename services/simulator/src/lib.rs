@@ -20,6 +20,7 @@ pub mod control;
 pub mod dynamics;
 pub mod estimator;
 pub mod failsafe;
+pub mod faults;
 pub mod flight;
 pub mod frames;
 pub mod gimbal;

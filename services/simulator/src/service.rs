@@ -71,7 +71,9 @@ impl SimulatorService {
     /// # Errors
     /// The bus refuses a channel, or a parameter of the configuration is unknown.
     pub fn open(context: &Context, links: UdpLinks, members: &[ServiceName]) -> Result<Self, ServiceError> {
-        let simulator = Simulator::new(vehicle_config(&context.config), links.instance()).map_err(|e| other(&e))?;
+        let simulator = Simulator::new(vehicle_config(&context.config), links.instance())
+            .map_err(|e| other(&e))?
+            .with_faults(&context.config.simulator.faults, context.config.mission.seed);
         let codes: Vec<u32> = members.iter().map(|m| m.code()).collect();
         let lockstep = context.config.clock.mode == ClockMode::Lockstep;
         let link = ServiceName::Px4Link.code();

@@ -5,8 +5,10 @@ use mavlink::dialects::common::{
     MESSAGE_INTERVAL_DATA, MISSION_COUNT_DATA, MavMessage, MavParamType, PARAM_VALUE_DATA, TIMESYNC_DATA,
 };
 use mavlink::types::CharArray;
+use shared_types::config::Fault;
 
 use crate::commands;
+use crate::faults::Faults;
 use crate::gimbal::Controller;
 use crate::mav::codec::{Outbox, RawAck, frames};
 use crate::mav::inbound::{Inbound, read};
@@ -14,7 +16,7 @@ use crate::mav::telemetry::{self, LinkCounters};
 use crate::mav::{ping, status};
 use crate::params::{Params, TYPE_INT32, Value};
 use crate::streams::{GROUND, ONBOARD, Streams};
-use crate::vehicle::{BadParameter, TrueState, Vehicle, VehicleConfig};
+use crate::vehicle::{BadParameter, TICK_NS, TrueState, Vehicle, VehicleConfig};
 
 /// The autopilot's component.
 const COMPONENT: u8 = 1;
@@ -89,6 +91,7 @@ pub struct Simulator {
     onboard: Link,
     ground: Link,
     last_modes: (u32, u32),
+    faults: Option<Faults>,
 }
 
 impl Simulator {
@@ -105,7 +108,15 @@ impl Simulator {
             onboard: Link::new(system_id, ONBOARD, true),
             ground: Link::new(system_id, GROUND, false),
             last_modes: (0, 0),
+            faults: None,
         })
+    }
+
+    /// The same with faults, which are decided by `seed`.
+    #[must_use]
+    pub fn with_faults(mut self, list: &[Fault], seed: u64) -> Self {
+        self.faults = Faults::new(list, seed, self.vehicle.system_id());
+        self
     }
 
     /// The vehicle.
@@ -127,6 +138,30 @@ impl Simulator {
 
     /// Reads a datagram. `late_ns` is how long after the last tick it came (0 in lockstep), so that TIMESYNC is exact.
     pub fn receive(&mut self, link: LinkId, datagram: &[u8], late_ns: u64) {
+        let (tick, boot_s) = (self.tick(), self.vehicle.boot_s());
+        let Some(faults) = self.faults.as_mut().filter(|_| link == LinkId::Onboard) else {
+            self.read(link, datagram, late_ns);
+            return;
+        };
+        let disturbance = faults.disturbance(boot_s);
+        faults.inbound.push(tick, datagram, &disturbance);
+        self.read_what_arrives(late_ns);
+    }
+
+    fn tick(&self) -> u64 {
+        self.vehicle.boot_ns() / TICK_NS
+    }
+
+    /// Reads what has come through a disturbed link by now.
+    fn read_what_arrives(&mut self, late_ns: u64) {
+        let tick = self.tick();
+        let arrived = self.faults.as_mut().map_or_else(Vec::new, |faults| faults.inbound.take(tick));
+        for datagram in arrived {
+            self.read(LinkId::Onboard, &datagram, late_ns);
+        }
+    }
+
+    fn read(&mut self, link: LinkId, datagram: &[u8], late_ns: u64) {
         let system_id = self.vehicle.system_id();
         for frame in frames(datagram) {
             let sender = (frame.system_id, frame.component_id);
@@ -227,7 +262,11 @@ impl Simulator {
 
     /// Advances by one tick of 10 ms and queues what is due.
     pub fn step(&mut self) {
+        if let Some(faults) = &mut self.faults {
+            faults.strike(&mut self.vehicle);
+        }
         self.vehicle.step();
+        self.let_strangers_speak();
         let now_ns = self.vehicle.boot_ns();
         let notices = self.vehicle.autopilot.take_notices();
         let modes = (self.vehicle.autopilot.mode().custom_mode(), self.vehicle.autopilot.intended_mode().custom_mode());
@@ -268,9 +307,26 @@ impl Simulator {
         }
     }
 
+    fn let_strangers_speak(&mut self) {
+        let (tick, boot_s) = (self.tick(), self.vehicle.boot_s());
+        if let Some(faults) = &mut self.faults {
+            faults.speak(tick, boot_s);
+            self.read_what_arrives(0);
+        }
+    }
+
     /// The datagrams to send now.
     pub fn take_datagrams(&mut self) -> Vec<(LinkId, Vec<u8>)> {
-        let onboard = self.onboard.outbox.take().into_iter().map(|d| (LinkId::Onboard, d));
+        let (tick, boot_s) = (self.tick(), self.vehicle.boot_s());
+        let mut onboard = self.onboard.outbox.take();
+        if let Some(faults) = &mut self.faults {
+            let disturbance = faults.disturbance(boot_s);
+            for datagram in &onboard {
+                faults.outbound.push(tick, datagram, &disturbance);
+            }
+            onboard = faults.outbound.take(tick);
+        }
+        let onboard = onboard.into_iter().map(|d| (LinkId::Onboard, d));
         let ground = self.ground.outbox.take().into_iter().map(|d| (LinkId::Ground, d));
         onboard.chain(ground).collect()
     }

@@ -4,6 +4,8 @@ use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
 
+use super::faults::Fault;
+
 /// Which estimator the simulated autopilot flies on, and reports.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
@@ -52,6 +54,9 @@ pub struct SimulatorConfig {
     pub instance: i32,
     /// Autopilot parameters that differ from PX4's defaults, by name.
     pub params: BTreeMap<String, f64>,
+    /// What goes wrong with vehicle and link, seeded and in simulated time: `loss 0.05`, `gone at 60 for 5`, `delay 0.5 at 30
+    /// for 10`, `jump 3 0 0 at 50`, `battery 0.06 at 70`, `pilot at 40 for 10`; a wrong word tells them all.
+    pub faults: Vec<Fault>,
 }
 
 impl Default for SimulatorConfig {
@@ -65,6 +70,7 @@ impl Default for SimulatorConfig {
             battery: 1.0,
             instance: -1,
             params: BTreeMap::new(),
+            faults: Vec::new(),
         }
     }
 }
