@@ -174,4 +174,45 @@ mod tests {
         let State::Training(run) = state.on(Event::Rejoined { now_ns: 9_000_000_000 }) else { panic!("training") };
         assert_eq!(run.next_due_ns(20), 9_250_000_000);
     }
+
+    /// Any event.
+    fn event() -> impl proptest::strategy::Strategy<Value = Event> {
+        use proptest::prelude::*;
+        prop_oneof![
+            any::<bool>().prop_map(|has_model| Event::Ready { has_model }),
+            Just(Event::Begun(running())),
+            (0u32..=90, any::<bool>()).prop_map(|(iterations, over)| Event::Slice { iterations, over }),
+            Just(Event::Finished),
+            Just(Event::Failed),
+            Just(Event::Published),
+            (0u64..20_000_000_000).prop_map(|now_ns| Event::Rejoined { now_ns }),
+        ]
+    }
+
+    proptest::proptest! {
+        /// A round is begun from rest alone, its final model is always published before the next, and from everywhere there
+        /// is a way back to rest.
+        #[test]
+        fn rounds_are_one_at_a_time_and_every_state_comes_to_rest(script in proptest::collection::vec(event(), 0..40)) {
+            let (mut state, mut begun, mut settled) = (State::Starting, 0u32, 0u32);
+            for event in script {
+                let next = state.on(event);
+                match (state, next) {
+                    (State::Idle, State::Training(_)) => begun += 1,
+                    (before, State::Training(_)) => proptest::prop_assert!(matches!(before, State::Training(_))),
+                    (State::Training(_), State::Publishing | State::Idle) => settled += 1,
+                    (State::Publishing, after) => {
+                        proptest::prop_assert!(after == State::Publishing || (after == State::Idle && event == Event::Published));
+                    }
+                    _ => {}
+                }
+                proptest::prop_assert!(settled <= begun && begun <= settled + 1);
+                state = next;
+            }
+            for event in [Event::Ready { has_model: true }, Event::Finished, Event::Published] {
+                state = state.on(event);
+            }
+            proptest::prop_assert_eq!(state, State::Idle);
+        }
+    }
 }
