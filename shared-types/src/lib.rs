@@ -8,11 +8,13 @@
 //! - [`frames`]: poses and the pinhole camera;
 //! - [`config`]: the configuration file;
 //! - [`folder`]: the mission folder, and files that appear whole;
+//! - [`fault_point`]: instants at which tests make processes die;
 //! - [`realtime`]: what a thread with a deadline asks of the kernel.
 
 pub mod bus;
 pub mod channel;
 pub mod config;
+pub mod fault_point;
 pub mod folder;
 pub mod frames;
 pub mod logging;

@@ -1,22 +1,38 @@
-//! One mission under kills.
+//! One mission under faults.
 
 use std::path::Path;
 use std::time::{Duration, Instant};
 
 use splatting::order::Random;
 
-use crate::common::{Flight, journal, keyframes, kill, runs, system_files, vantage};
+use crate::common::watch::{Moment, Watch};
+use crate::common::{Flight, kill, runs, system_files, vantage};
+use crate::judge::judge;
 use crate::record::{Fault, Flown, Mission};
-use crate::{Options, phase};
+use crate::{Blow, Options, phase};
 
-/// What may be killed; the simulator is the vehicle.
+/// What may be hit; the simulator is the vehicle.
 const SERVICES: [&str; 8] = ["px4-link", "camera", "trainer", "scorer", "planner", "keeper", "world", "launch"];
 /// Longest wait for a new process, and for the services to end after launch.
 const PATIENCE: Duration = Duration::from_secs(60);
 /// Longest wait for a phase.
 const PHASE_PATIENCE: Duration = Duration::from_secs(5);
-/// Ids from here on are views of the prior, of which only the newest counts.
-const PRIOR_IDS: u64 = 1_000_000;
+/// How long px4-link is waited for to fly by setpoints again; in many phases it need not.
+const OFFBOARD_PATIENCE: Duration = Duration::from_secs(3);
+/// Seed of the missions, or of the first.
+const SEED: u64 = 21;
+
+/// A mission that is being flown.
+struct Flying<'a> {
+    options: &'a Options,
+    index: u64,
+    folder: &'a Path,
+    /// `None` once launch was killed for good.
+    flight: Option<(Flight, Watch)>,
+    faults: Vec<Fault>,
+    largest_step_m: f64,
+    error: String,
+}
 
 /// Flies mission `index`.
 pub fn fly(options: &Options, index: u64) -> Flown {
@@ -25,65 +41,165 @@ pub fn fly(options: &Options, index: u64) -> Flown {
     let before = system_files();
     let began = Instant::now();
     let mut random = Random::new(options.seed ^ index.wrapping_mul(0x9e37_79b9));
-    let crash_limit = "launch.crash_limit=1000";
-    let mut flight = Some(Flight::start(&folder, &["--preset", &options.preset, "--seed", "21", "--set", crash_limit]));
-    let mut faults: Vec<Fault> = Vec::new();
-    let mut error = String::new();
+    let seed = if options.vary_seed { SEED + index } else { SEED };
+    let text = seed.to_string();
+    let mut arguments = vec!["--preset", &options.preset, "--seed", &text, "--set", "launch.crash_limit=1000"];
+    arguments.extend(options.sets.iter().flat_map(|set| ["--set", set]));
+    let flight = Flight::start(&folder, &arguments);
+    let watch = Watch::begin(flight.pid());
+    let mut flying = Flying {
+        options,
+        index,
+        folder: &folder,
+        flight: Some((flight, watch)),
+        faults: Vec::new(),
+        largest_step_m: 0.0,
+        error: String::new(),
+    };
     for _ in 0..options.kills {
-        let Some(flying) = flight.as_mut() else { break };
-        await_a_phase(flying, &folder, &mut random);
-        std::thread::sleep(Duration::from_millis(u64::from(random.below(options.pause_ms.max(1) as u32))));
-        let services = flying.services();
-        let service = match &options.service {
-            Some(service) => service.as_str(),
-            None => SERVICES[random.below(SERVICES.len() as u32) as usize],
-        };
-        let pid = if service == "launch" { Some(flying.pid()) } else { services.get(service).copied() };
-        let Some(pid) = pid.filter(|pid| runs(*pid)) else { continue };
-        let mut fault = Fault {
-            mission: index,
-            service: service.to_owned(),
-            phase: phase::of(&folder).to_owned(),
-            restart_ms: None,
-        };
-        let killed = Instant::now();
-        kill(pid, "KILL");
-        if service == "launch" {
-            if let Some(flight) = flight.take() {
-                let _killed = flight.finish();
-            }
-            while services.values().any(|pid| runs(*pid)) && killed.elapsed() < PATIENCE {
-                std::thread::sleep(Duration::from_millis(20));
-            }
-            if services.values().any(|pid| runs(*pid)) {
-                "services outlive launch by a minute".clone_into(&mut error);
-            }
-            // Killed before there was a mission, or after all was said: a user would look, and fly or be done.
-            if folder.join("mission.toml").exists() {
-                let mut resume = vantage();
-                resume.arg("resume").arg(&folder);
-                flight = Some(Flight::spawn(&folder, resume));
-            }
-        } else {
-            fault.restart_ms = new_process(flying, service, pid, killed);
+        if flying.flight.is_none() {
+            break;
         }
-        faults.push(fault);
+        flying.strike(&mut random);
     }
-    if let Some(flight) = flight {
-        let terminal = folder.with_extension("terminal.log");
-        let status = flight.finish();
-        if !status.success() {
-            let text = std::fs::read_to_string(terminal).unwrap_or_default();
-            error += &format!("{status}: {}", text.lines().last().unwrap_or_default());
-        }
-    }
-    let leftovers = system_files().into_iter().filter(|path| !before.contains(path)).count();
-    let mission = judge(index, &folder, leftovers, began.elapsed().as_secs_f64(), error);
+    let mission = flying.end(seed, began, &before);
     if mission.is_well() {
         drop(std::fs::remove_dir_all(&folder));
         drop(std::fs::remove_file(folder.with_extension("terminal.log")));
     }
-    Flown { mission, faults }
+    Flown { faults: flying.faults, mission }
+}
+
+impl Flying<'_> {
+    /// One fault: at a phase that is drawn, on services that are drawn.
+    fn strike(&mut self, random: &mut Random) {
+        let options = self.options;
+        let Some((flight, _)) = self.flight.as_ref() else { return };
+        if !options.storm {
+            await_a_phase(flight, self.folder, random);
+        }
+        std::thread::sleep(Duration::from_millis(u64::from(random.below(options.pause_ms.max(1) as u32))));
+        let services = flight.services();
+        let drawn = self.draw(random);
+        let pid_of = |name: &str| if name == "launch" { Some(flight.pid()) } else { services.get(name).copied() };
+        let targets: Vec<(&str, u32)> =
+            drawn.into_iter().filter_map(|name| Some((name, pid_of(name).filter(|pid| runs(*pid))?))).collect();
+        let (phase, fault) = (phase::of(self.folder).to_owned(), Moment::now());
+        let signal = match options.blow {
+            Blow::Kill => "KILL",
+            Blow::Term => "TERM",
+            Blow::Stop => "STOP",
+        };
+        for (_, pid) in &targets {
+            kill(*pid, signal);
+        }
+        if options.blow == Blow::Stop {
+            std::thread::sleep(Duration::from_secs_f64(options.stop_s));
+            for (_, pid) in &targets {
+                kill(*pid, "CONT");
+            }
+        }
+        let blow = match options.blow {
+            Blow::Kill => "kill".to_owned(),
+            Blow::Term => "term".to_owned(),
+            Blow::Stop => format!("stop {} s", options.stop_s),
+        };
+        for (name, _) in &targets {
+            let back = *name != "launch" && options.blow != Blow::Stop && !options.storm;
+            let work_ms = if back { self.back(name, fault) } else { None };
+            let offboard_ms = if back && *name == "px4-link" { self.offboard(fault) } else { None };
+            let (service, phase, blow) = ((*name).to_owned(), phase.clone(), blow.clone());
+            self.faults.push(Fault { mission: self.index, service, blow, phase, work_ms, offboard_ms });
+        }
+        if options.blow == Blow::Kill && targets.iter().any(|(name, _)| *name == "launch") {
+            self.resume(&services.into_values().collect::<Vec<_>>());
+        }
+    }
+
+    /// Different services, launch last: who is hit together with it has no supervisor any more.
+    fn draw(&self, random: &mut Random) -> Vec<&'static str> {
+        if let Some(only) = &self.options.service {
+            return SERVICES.into_iter().filter(|name| name == only).collect();
+        }
+        // SIGTERM to launch ends the mission, as it should.
+        let mut left: Vec<&str> =
+            SERVICES.into_iter().filter(|name| self.options.blow != Blow::Term || *name != "launch").collect();
+        let mut drawn = Vec::new();
+        for _ in 0..self.options.at_once.min(left.len()) {
+            drawn.push(left.swap_remove(random.below(left.len() as u32) as usize));
+        }
+        drawn.sort_by_key(|name| *name == "launch");
+        drawn
+    }
+
+    /// Milliseconds until the service does useful work again.
+    fn back(&self, service: &str, fault: Moment) -> Option<f64> {
+        let (flight, watch) = self.flight.as_ref()?;
+        wait_for(PATIENCE, fault, flight, || watch.back_after(service, fault))
+    }
+
+    /// Milliseconds until px4-link flies by setpoints again.
+    fn offboard(&self, fault: Moment) -> Option<f64> {
+        let (flight, watch) = self.flight.as_ref()?;
+        wait_for(OFFBOARD_PATIENCE, fault, flight, || watch.offboard_after(fault))
+    }
+
+    /// After launch was killed: waits until its services have ended, and flies on.
+    fn resume(&mut self, services: &[u32]) {
+        self.take_notes();
+        if let Some((flight, _)) = self.flight.take() {
+            let _killed = flight.finish();
+        }
+        let began = Instant::now();
+        while services.iter().any(|pid| runs(*pid)) && began.elapsed() < PATIENCE {
+            std::thread::sleep(Duration::from_millis(20));
+        }
+        if services.iter().any(|pid| runs(*pid)) {
+            "services outlive launch by a minute".clone_into(&mut self.error);
+        }
+        // Killed before there was a mission: a user would look, and fly.
+        if self.folder.join("mission.toml").exists() {
+            let mut resume = vantage();
+            resume.arg("resume").arg(self.folder);
+            let flight = Flight::spawn(self.folder, resume);
+            let watch = Watch::begin(flight.pid());
+            self.flight = Some((flight, watch));
+        }
+    }
+
+    fn take_notes(&mut self) {
+        if let Some((_, watch)) = &self.flight {
+            self.largest_step_m = self.largest_step_m.max(watch.look(|heard| heard.largest_step_m));
+        }
+    }
+
+    fn end(&mut self, seed: u64, began: Instant, before: &[std::path::PathBuf]) -> Mission {
+        if let Some((flight, watch)) = self.flight.take() {
+            let terminal = self.folder.with_extension("terminal.log");
+            let status = flight.finish();
+            self.largest_step_m = self.largest_step_m.max(watch.look(|heard| heard.largest_step_m));
+            if !status.success() {
+                let text = std::fs::read_to_string(terminal).unwrap_or_default();
+                self.error += &format!("{status}: {}", text.lines().last().unwrap_or_default());
+            }
+        }
+        let mut mission = Mission {
+            mission: self.index,
+            seed,
+            end_reason: String::new(),
+            lost: 0,
+            doubled: 0,
+            psnr_db: None,
+            clearance_m: None,
+            largest_step_m: self.largest_step_m,
+            collisions: 0,
+            leftovers: system_files().into_iter().filter(|path| !before.contains(path)).count(),
+            wall_s: began.elapsed().as_secs_f64(),
+            error: core::mem::take(&mut self.error),
+        };
+        judge(&mut mission, self.folder);
+        mission
+    }
 }
 
 /// Waits until the mission is in a phase that is drawn, so that short ones have their share; not for long, and not for one
@@ -100,55 +216,13 @@ fn await_a_phase(flight: &Flight, folder: &Path, random: &mut Random) {
     }
 }
 
-/// Milliseconds until the service has another process.
-fn new_process(flight: &Flight, service: &str, old: u32, killed: Instant) -> Option<f64> {
-    while killed.elapsed() < PATIENCE && runs(flight.pid()) {
-        if flight.services().get(service).is_some_and(|&pid| pid != old && runs(pid)) {
-            return Some(1e3 * killed.elapsed().as_secs_f64());
+/// Milliseconds that `look` gives at last; `None` where the mission ended, or time was over, before.
+fn wait_for(patience: Duration, fault: Moment, flight: &Flight, look: impl Fn() -> Option<Duration>) -> Option<f64> {
+    while fault.at.elapsed() < patience && runs(flight.pid()) {
+        if let Some(after) = look() {
+            return Some(1e3 * after.as_secs_f64());
         }
         std::thread::sleep(Duration::from_millis(2));
     }
     None
-}
-
-fn judge(index: u64, folder: &Path, leftovers: usize, wall_s: f64, error: String) -> Mission {
-    let mut mission = Mission {
-        mission: index,
-        end_reason: String::new(),
-        lost: 0,
-        doubled: 0,
-        psnr_db: None,
-        clearance_m: None,
-        collisions: 0,
-        leftovers,
-        wall_s,
-        error,
-    };
-    if !folder.join("mission.toml").exists() {
-        // Launch died before the mission was; there is nothing to lose.
-        "complete".clone_into(&mut mission.end_reason);
-        return mission;
-    }
-    let entries = journal(folder);
-    let reason = entries.iter().rev().find(|entry| entry["event"] == "over").map(|entry| entry["reason"].clone());
-    mission.end_reason = reason.and_then(|reason| Some(reason.as_str()?.to_owned())).unwrap_or_default();
-    let there = keyframes(folder);
-    let wanted = entries.iter().filter(|entry| entry["event"] == "captured").filter_map(|e| e["keyframe_id"].as_u64());
-    let mut captured: Vec<u64> = wanted.filter(|id| *id < PRIOR_IDS).collect();
-    let all = captured.len();
-    captured.sort_unstable();
-    captured.dedup();
-    mission.doubled = all - captured.len();
-    let dropped = entries.iter().filter(|entry| entry["event"] == "dropped").count();
-    mission.lost = captured.iter().filter(|id| !there.contains(id)).count() + dropped;
-    let text = std::fs::read_to_string(folder.join("report/metrics.json")).unwrap_or_default();
-    match serde_json::from_str::<serde_json::Value>(&text) {
-        Ok(metrics) => {
-            mission.psnr_db = metrics["live"]["psnr_object_db"].as_f64();
-            mission.clearance_m = metrics["mission"]["min_clearance_m"].as_f64();
-            mission.collisions = metrics["mission"]["collisions"].as_u64().unwrap_or(0);
-        }
-        Err(error) => mission.error += &format!(" metrics.json: {error}"),
-    }
-    mission
 }

@@ -6,18 +6,34 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
-/// One kill.
+/// No setpoint is farther from the one before.
+const LARGEST_STEP_M: f64 = 0.3;
+/// Radius of the vehicle and the error of an exact estimator: what the path planner's clearance is made of, without its
+/// margin, which may be eaten up by braking.
+const LEAST_CLEARANCE_M: f64 = 0.47;
+
+/// One fault.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct Fault {
     /// Index of the mission.
     pub mission: u64,
-    /// What was killed.
+    /// What was hit.
     pub service: String,
+    /// What was done to it.
+    #[serde(default = "kill")]
+    pub blow: String,
     /// Where the mission was.
     pub phase: String,
-    /// Wall time from the kill until the service's new process was there, milliseconds; absent where none came: the
-    /// mission was at its end, or launch itself was killed.
-    pub restart_ms: Option<f64>,
+    /// Wall time from the fault until the service's new process did useful work, milliseconds; absent where none came: the
+    /// mission was at its end, launch itself was hit, or the process was only stopped.
+    pub work_ms: Option<f64>,
+    /// The same until px4-link flew the vehicle by setpoints again; absent where it did not, or was not hit.
+    #[serde(default)]
+    pub offboard_ms: Option<f64>,
+}
+
+fn kill() -> String {
+    "kill".to_owned()
 }
 
 /// One mission.
@@ -25,6 +41,9 @@ pub struct Fault {
 pub struct Mission {
     /// Its index.
     pub mission: u64,
+    /// Its seed.
+    #[serde(default)]
+    pub seed: u64,
     /// How it ended, by its journal.
     pub end_reason: String,
     /// Keyframes that are missing, and that the journal has more than once.
@@ -35,6 +54,9 @@ pub struct Mission {
     pub psnr_db: Option<f64>,
     /// Least distance to anything, metres.
     pub clearance_m: Option<f64>,
+    /// Longest way between two setpoints of a stream, metres.
+    #[serde(default)]
+    pub largest_step_m: f64,
     /// Collisions.
     pub collisions: u64,
     /// Files and folders left in shared memory.
@@ -51,6 +73,8 @@ impl Mission {
         self.end_reason == "complete"
             && self.lost + self.doubled + self.leftovers == 0
             && self.collisions == 0
+            && self.largest_step_m <= LARGEST_STEP_M
+            && self.clearance_m.is_none_or(|metres| metres >= LEAST_CLEARANCE_M)
             && self.error.is_empty()
     }
 
@@ -60,8 +84,15 @@ impl Mission {
             return "well".to_owned();
         }
         format!(
-            "NOT WELL: ended \"{}\", {} keyframes lost, {} doubled, {} left over, {} collisions {}",
-            self.end_reason, self.lost, self.doubled, self.leftovers, self.collisions, self.error
+            "NOT WELL: ended \"{}\", {} keyframes lost, {} doubled, {} left over, {} collisions, step {:.2} m, clearance {:?} m {}",
+            self.end_reason,
+            self.lost,
+            self.doubled,
+            self.leftovers,
+            self.collisions,
+            self.largest_step_m,
+            self.clearance_m,
+            self.error
         )
     }
 }
