@@ -14,6 +14,8 @@ use crate::state::State;
 
 /// Link age at which the mission ends, seconds.
 const LINK_LOST_S: f64 = 10.0;
+/// Link age from which nothing is asked of a vehicle in the air: px4-link decides nothing in such a silence either.
+const LINK_QUIET_NS: u64 = 500_000_000;
 /// Refusals after which a command is not tried again.
 const MOST_REFUSALS: u32 = 3;
 
@@ -127,6 +129,11 @@ impl Mission {
     pub(super) fn launching(&mut self) -> State {
         let Some(vehicle) = self.vehicle else { return State::Launching };
         let grounded = vehicle.landed == 1;
+        if !grounded && vehicle.link_age_ns > LINK_QUIET_NS {
+            // Whoever cannot hear refuses nothing: it is waited for, until the link counts as lost.
+            self.refusals = 0;
+            return State::Launching;
+        }
         if self.homeward() && grounded {
             return if vehicle.armed == 1 { State::Landing } else { State::Finishing };
         }
