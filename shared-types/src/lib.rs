@@ -9,6 +9,7 @@
 //! - [`config`]: the configuration file;
 //! - [`folder`]: the mission folder, and files that appear whole;
 //! - [`fault_point`]: instants at which tests make processes die;
+//! - [`storage`]: the disk, as far as it is written to; tests record, cut, fill and slow it;
 //! - [`realtime`]: what a thread with a deadline asks of the kernel.
 
 pub mod bus;
@@ -23,6 +24,7 @@ pub mod messages;
 pub mod payload;
 pub mod realtime;
 pub mod service;
+pub mod storage;
 pub mod system;
 
 pub use payload::Payload;

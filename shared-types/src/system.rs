@@ -13,6 +13,9 @@ use std::time::Duration;
 use rustix::fs::{FlockOperation, flock};
 use serde::{Deserialize, Serialize};
 
+use crate::folder::{FolderError, clean_leftovers, write_atomic};
+use crate::storage;
+
 /// Where iceoryx2 keeps shared memory.
 pub const SHARED_MEMORY_DIR: &str = "/dev/shm";
 
@@ -163,21 +166,18 @@ impl System {
             system.prefix
         );
         let config_path = system.bus_config_path();
-        io(&config_path, "write", fs::write(&config_path, config))?;
+        write_whole(&config_path, config.as_bytes())?;
         let description = system.runtime_dir.join("system.json");
         let text = serde_json::to_string_pretty(&system)
             .map_err(|source| SystemError::Malformed { path: description.clone(), source })?;
-        // Written aside and renamed: tools that list systems never read half of it.
-        let aside = system.runtime_dir.join("system.json.new");
-        io(&aside, "write", fs::write(&aside, text))?;
-        io(&description, "rename", fs::rename(&aside, &description))?;
+        write_whole(&description, text.as_bytes())?;
         Ok((system, hold))
     }
 
     /// Makes the folder and holds it. Another process may make or remove the same one at the same time: then once more.
     fn claim_folder(&self) -> Result<Hold, SystemError> {
         for _ in 0..50 {
-            match fs::create_dir(&self.runtime_dir) {
+            match storage::of(&self.runtime_dir).create_dir(&self.runtime_dir) {
                 Ok(()) => match self.hold() {
                     Err(SystemError::Ended { .. } | SystemError::Runs { .. }) => {}
                     held => return held,
@@ -337,14 +337,22 @@ fn remove_dead(folder: &Path) -> Result<(), SystemError> {
         Ok(system) => System { runtime_dir: folder.to_owned(), ..system }.remove(),
         // Its maker was killed before the description was there: nothing else can be inside yet.
         Err(error) if error.is_absent() => {
-            for file in ["iceoryx2.toml", "system.json.new"] {
-                fs::remove_file(folder.join(file)).ok();
-            }
+            fs::remove_file(folder.join("iceoryx2.toml")).ok();
+            // A leftover that cannot be removed is told by the folder, which then cannot be either.
+            clean_leftovers(folder).ok();
             io(folder, "remove", fs::remove_dir(folder))
         }
         // Without its description, its files in shared memory cannot be told from others'.
         Err(error) => Err(error),
     }
+}
+
+/// Tools that list systems never read half of a file, whatever dies meanwhile.
+fn write_whole(path: &Path, bytes: &[u8]) -> Result<(), SystemError> {
+    write_atomic(path, bytes).map_err(|error| match error {
+        FolderError::Io { action, path, source } => SystemError::Io { path, action, source },
+        other => SystemError::Io { path: path.to_owned(), action: "write", source: std::io::Error::other(other) },
+    })
 }
 
 fn io<T>(path: &Path, action: &'static str, result: std::io::Result<T>) -> Result<T, SystemError> {

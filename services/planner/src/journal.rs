@@ -3,12 +3,11 @@
 //! Stamps are mission time; nothing of the wall's clock, of processes or of absolute paths is in it, so that the same
 //! mission writes the same journal. The number of a line is the id of the request or target that it announces.
 
-use std::fs::{File, OpenOptions};
-use std::io::{Read as _, Seek as _, SeekFrom, Write as _};
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 use shared_types::messages::{EndReason, KeyframeReason, VehicleCommand};
+use shared_types::storage::{self, WriteFile};
 
 use crate::logic::prior::Prior;
 
@@ -22,6 +21,16 @@ pub enum JournalError {
         action: &'static str,
         /// The file.
         path: PathBuf,
+        /// The system's reason.
+        source: std::io::Error,
+    },
+    /// No room for more lines.
+    #[error("no room for {bytes} bytes more of the journal {path}: free disk space ({source})")]
+    Full {
+        /// The file.
+        path: PathBuf,
+        /// What was to be appended.
+        bytes: usize,
         /// The system's reason.
         source: std::io::Error,
     },
@@ -242,8 +251,12 @@ pub struct Entry {
 /// The file.
 #[derive(Debug)]
 pub struct Journal {
-    file: File,
+    file: Box<dyn WriteFile>,
     path: PathBuf,
+    /// Length of what was appended for certain.
+    good: u64,
+    /// An append failed, and what it left was not cut off yet.
+    torn: bool,
 }
 
 impl Journal {
@@ -253,45 +266,72 @@ impl Journal {
     /// [`JournalError`] where the file cannot be had, or a line before the last is damaged.
     pub fn open(path: &Path) -> Result<(Self, Vec<Entry>), JournalError> {
         let io = |action| move |source| JournalError::Io { action, path: path.to_owned(), source };
-        let mut file =
-            OpenOptions::new().create(true).truncate(false).read(true).write(true).open(path).map_err(io("open"))?;
-        let mut bytes = Vec::new();
-        file.read_to_end(&mut bytes).map_err(io("read"))?;
+        let disk = storage::of(path);
+        let file = disk.append(path).map_err(io("open"))?;
+        let bytes = std::fs::read(path).map_err(io("read"))?;
         let (entries, good) = parse(&bytes, path)?;
-        if good < bytes.len() {
-            tracing::warn!(bytes = bytes.len() - good, "a torn last line of the journal is dropped");
-            file.set_len(good as u64).map_err(io("repair"))?;
-            file.sync_data().map_err(io("repair"))?;
+        let mut journal = Self { file, path: path.to_owned(), good: good as u64, torn: good < bytes.len() };
+        if journal.torn {
+            tracing::warn!(bytes = bytes.len() - good, "the torn end of the journal is dropped");
+            journal.mend().and_then(|()| journal.file.sync()).map_err(io("repair"))?;
         }
-        file.seek(SeekFrom::End(0)).map_err(io("read"))?;
         if let Some(folder) = path.parent() {
             // The file's name in the folder is to last as long as its lines.
-            File::open(folder).and_then(|folder| folder.sync_all()).map_err(io("sync the folder of"))?;
+            disk.sync_dir(folder).map_err(io("sync the folder of"))?;
         }
-        Ok((Self { file, path: path.to_owned() }, entries))
+        Ok((journal, entries))
     }
 
     /// Appends entries and brings them to the disk.
     ///
     /// # Errors
-    /// [`JournalError::Io`]; nothing that the entries announce may be done then.
+    /// [`JournalError::Full`] and [`JournalError::Io`]; nothing that the entries announce may be done then. The same may be
+    /// tried again: what a failed try left is cut off first.
     pub fn append(&mut self, entries: &[Entry]) -> Result<(), JournalError> {
         if entries.is_empty() {
             return Ok(());
         }
-        let io = |action, source| JournalError::Io { action, path: self.path.clone(), source };
+        let path = self.path.clone();
+        let io = |action, source| JournalError::Io { action, path: path.clone(), source };
         let mut text = String::new();
         for entry in entries {
             let line = serde_json::to_string(entry).map_err(|error| io("write", std::io::Error::other(error)))?;
             text.push_str(&line);
             text.push('\n');
         }
-        self.file.write_all(text.as_bytes()).map_err(|source| io("append to", source))?;
-        self.file.sync_data().map_err(|source| io("sync", source))
+        if self.torn {
+            self.mend().map_err(|source| io("repair", source))?;
+        }
+        match self.file.write(text.as_bytes()).and_then(|()| self.file.sync()) {
+            Ok(()) => {
+                self.good += text.len() as u64;
+                Ok(())
+            }
+            Err(source) => {
+                self.torn = true;
+                // Another process may read the journal meanwhile; where this fails, the next try does it.
+                self.mend().ok();
+                Err(if storage::is_full(&source) {
+                    JournalError::Full { path, bytes: text.len(), source }
+                } else {
+                    io("append to", source)
+                })
+            }
+        }
+    }
+
+    /// Cuts off what is not whole.
+    fn mend(&mut self) -> std::io::Result<()> {
+        self.file.cut(self.good)?;
+        self.torn = false;
+        Ok(())
     }
 }
 
 /// Reads the entries of a journal, and how many bytes of it are whole lines.
+///
+/// What one turn appends is synced at once. A loss of power within that may leave blocks of it on the disk and others not,
+/// which then read as zeros: such a hole is the journal's end where all that follows is of one turn.
 ///
 /// # Errors
 /// [`JournalError::Damaged`] for a line before the last that is no entry or has the wrong number.
@@ -314,12 +354,19 @@ pub fn parse(bytes: &[u8], path: &Path) -> Result<(Vec<Entry>, usize), JournalEr
             Ok(entry) => format!("has number {}", entry.id),
             Err(error) => format!("{error}"),
         };
-        if last {
+        if last || (line.contains(&0) && is_one_turn(lines.clone())) {
             break;
         }
         return Err(JournalError::Damaged { path: path.to_owned(), line: number, found: problem });
     }
     Ok((entries, good))
+}
+
+/// Whether all lines that can be read are of the same turn.
+fn is_one_turn<'a>(lines: impl Iterator<Item = &'a [u8]>) -> bool {
+    let mut stamps = lines.filter_map(|line| serde_json::from_slice::<Entry>(line).ok()).map(|entry| entry.now_ns);
+    let first = stamps.next();
+    stamps.all(|stamp| Some(stamp) == first)
 }
 
 #[cfg(test)]

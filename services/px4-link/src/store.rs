@@ -1,10 +1,10 @@
 //! What must outlive px4-link: the checked way back, and whose vehicle it was. Small files in the system folder, whole or
 //! absent.
 
-use std::io::Write as _;
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
+use shared_types::folder::write_atomic;
 use shared_types::messages::{FlightMode, Waypoint};
 
 use crate::frames::KeptTransform;
@@ -113,15 +113,11 @@ impl Store {
 
     fn write<T: Serialize>(&self, name: &str, value: &T) {
         let path = self.folder.join(name);
-        let aside = self.folder.join(format!("{name}.new"));
-        let result = serde_json::to_vec(value).map_err(std::io::Error::other).and_then(|bytes| {
-            let mut file = std::fs::File::create(&aside)?;
-            file.write_all(&bytes)?;
-            file.sync_all()?;
-            std::fs::rename(&aside, &path)
-        });
-        if let Err(error) = result {
-            tracing::warn!(path = %path.display(), %error, "cannot be written; a restart would not know it");
+        let written = serde_json::to_vec(value)
+            .map_err(|error| error.to_string())
+            .and_then(|bytes| write_atomic(&path, &bytes).map_err(|error| error.to_string()));
+        if let Err(error) = written {
+            tracing::warn!(path = %path.display(), error, "cannot be written; a restart would not know it");
         }
     }
 
@@ -165,6 +161,37 @@ mod tests {
         assert_eq!(store.kept(), Kept::default());
         std::fs::write(folder.path().join("px4-link.json"), b"{\"last_target_id\":3}").expect("written");
         assert_eq!(store.kept().last_target_id, 3, "a file of an older version");
+    }
+
+    #[test]
+    fn a_loss_of_power_leaves_the_old_or_the_new() {
+        use shared_types::storage::record::Recorder;
+        use shared_types::storage::{mount, replay::every_outcome};
+
+        let folder = tempfile::tempdir_in("/dev/shm").expect("tmpfs");
+        let store = Store::new(folder.path());
+        let kept = |id| Kept { ours: true, last_target_id: id, ..Kept::default() };
+        let way = |x| WayBack { points: vec![[x, 2.0, 3.0, 0.0, -0.5, 1.0]; 4] };
+        store.keep(&kept(1));
+        store.keep_way_back(&way(1.0));
+        let recorder = Recorder::new(folder.path()).expect("read");
+        let mounted = mount(folder.path(), std::sync::Arc::new(recorder.clone()));
+        store.keep(&kept(2));
+        store.keep_way_back(&way(2.0));
+        drop(mounted);
+        let after = folder.path().join("after");
+        let findings = every_outcome(&recorder.trace(), &after, |root| {
+            let store = Store::new(root);
+            match (store.kept(), store.way_back()) {
+                (a, b) if a == kept(1) && b == way(1.0) => Ok("old"),
+                (a, b) if a == kept(2) && b == way(1.0) => Ok("between"),
+                (a, b) if a == kept(2) && b == way(2.0) => Ok("new"),
+                other => Err(format!("{other:?}")),
+            }
+        })
+        .expect("one after the other");
+        println!("px4-link's files: {} cuts, {} outcomes: {:?}", findings.places, findings.distinct, findings.by_name);
+        assert_eq!(findings.by_name.len(), 3, "{findings:?}");
     }
 
     #[test]

@@ -8,6 +8,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use shared_types::folder::{FolderError, write_atomic};
+use shared_types::storage;
 use splatting::bytes::{Reader, Truncated, Writer, checksum};
 use splatting::order::ViewOrder;
 use splatting::{DensifierState, Gaussians, Optimiser, ScreenStatistics, Training};
@@ -163,7 +164,7 @@ pub fn write(folder: &Path, training: &Training, progression: &Progression, run:
     let path = folder.join(format!("checkpoint-{:09}.ckpt", progression.iteration));
     write_atomic(&path, &to_bytes(training, progression, run))?;
     for (_, old) in list(folder).into_iter().skip(KEPT) {
-        if let Err(error) = fs::remove_file(&old) {
+        if let Err(error) = storage::of(&old).remove_file(&old) {
             tracing::warn!(path = %old.display(), %error, "cannot remove an old checkpoint");
         }
     }
@@ -195,7 +196,7 @@ pub fn any(folder: &Path) -> Option<String> {
 /// Removes all checkpoints of a folder.
 pub fn remove_all(folder: &Path) {
     for (_, path) in list(folder) {
-        if let Err(error) = fs::remove_file(&path) {
+        if let Err(error) = storage::of(&path).remove_file(&path) {
             tracing::warn!(path = %path.display(), %error, "cannot remove a checkpoint");
         }
     }

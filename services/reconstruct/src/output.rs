@@ -3,7 +3,8 @@
 use std::fs::{self, File, TryLockError};
 use std::path::{Component, Path, PathBuf};
 
-use shared_types::folder::write_atomic;
+use shared_types::folder::{create_dir_durable, write_atomic};
+use shared_types::storage;
 
 use crate::checkpoint::{self, State};
 use crate::error::ReconstructError;
@@ -40,9 +41,14 @@ impl Output {
             let path = path.to_owned();
             |source| ReconstructError::Output { path, source }
         };
-        fs::create_dir_all(root).map_err(refused(root))?;
+        create_dir_durable(root)?;
         let path = root.join(LOCK);
-        let lock = File::options().create(true).write(true).truncate(false).open(&path).map_err(refused(&path))?;
+        if !path.exists() {
+            // It tells that what lies beside it is ours: on the disk before all of that.
+            let disk = storage::of(root);
+            disk.append(&path).and_then(|_file| disk.sync_dir(root)).map_err(refused(&path))?;
+        }
+        let lock = File::options().write(true).open(&path).map_err(refused(&path))?;
         match lock.try_lock() {
             Ok(()) => Ok(Self { root: root.to_owned(), _lock: lock }),
             Err(TryLockError::WouldBlock) => Err(ReconstructError::Busy { out: root.to_owned() }),
@@ -91,7 +97,7 @@ impl Output {
         }
         checkpoint::remove_all(&self.root);
         for name in RESULTS {
-            match fs::remove_file(self.path(name)) {
+            match storage::of(&self.root).remove_file(&self.path(name)) {
                 Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
                     return Err(ReconstructError::Output { path: self.path(name), source: error });
                 }

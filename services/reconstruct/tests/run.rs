@@ -315,3 +315,68 @@ fn a_run_changes_its_back_end() {
     let message = message.to_string();
     assert!(message.contains("No Such GPU 9000") && message.contains(&adapter.name), "{message}");
 }
+
+/// A loss of power at any place of a run: what it then finds in its folder is its own, and it goes on from the newest whole
+/// checkpoint to the same model.
+#[test]
+fn a_run_whose_power_was_cut_goes_on_to_the_same_bits() {
+    use reconstruct::output::Output;
+    use shared_types::storage;
+    use shared_types::storage::record::Recorder;
+    use shared_types::storage::replay::every_outcome;
+
+    let dir = tempfile::tempdir_in("/dev/shm").expect("tmpfs");
+    scene(dir.path());
+    let broken = Options {
+        iterations: 4,
+        eval_every: 2,
+        max_gaussians: 150,
+        checkpoint_period: Duration::ZERO,
+        ..options(dir.path(), "broken")
+    };
+    let disk = dir.path().join("broken");
+    fs::create_dir(&disk).expect("folder");
+    let recorder = Recorder::new(&disk).expect("read");
+    let mount = storage::mount(&disk, std::sync::Arc::new(recorder.clone()));
+    finish(&broken);
+    drop(mount);
+    let whole = model(&broken);
+    fs::remove_dir_all(&disk).expect("removed");
+    let (mut shown, mut completed) = (0_usize, 0);
+    let findings = every_outcome(&recorder.trace(), &disk, |_| {
+        shown += 1;
+        let text = |error: ReconstructError| error.to_string();
+        if disk.join("metrics.json").exists() {
+            return match reconstruct::finished(&broken).map_err(text)? {
+                Some(report) if report.gaussians > 0 && model(&broken) == whole => Ok("finished"),
+                other => Err(format!("finished, and not: {other:?}")),
+            };
+        }
+        // All are looked at as a run does that begins; some are gone on with to the end.
+        let output = Output::open(&disk).map_err(text)?;
+        let state = match output.identity().map_err(text)? {
+            Some(identity) => output.admit(&identity, false).map_err(text)?,
+            None => None,
+        };
+        drop(output);
+        if shown.is_multiple_of(2003) {
+            completed += 1;
+            finish(&broken);
+            if model(&broken) != whole {
+                return Err("another model".to_owned());
+            }
+        }
+        Ok(match state.map(|state| state.progression.iteration) {
+            None => "begun anew",
+            Some(0) => "resumed at 0",
+            Some(_) => "resumed later",
+        })
+    });
+    let findings = findings.unwrap_or_else(|why| panic!("{why}"));
+    println!(
+        "a run's folder: {} cuts, {} outcomes: {:?}; {completed} completed",
+        findings.places, findings.distinct, findings.by_name
+    );
+    assert_eq!(findings.by_name.len(), 4, "{findings:?}");
+    assert!(completed > 3, "{completed}");
+}

@@ -9,6 +9,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use shared_types::folder::{FolderError, write_atomic};
+use shared_types::storage;
 use splatting::{Gaussians, Optimiser};
 
 use crate::logic::rounds::LossHistory;
@@ -167,7 +168,7 @@ pub fn write(folder: &Path, session: &Session) -> Result<PathBuf, FolderError> {
     let all = list(folder);
     let newest_final = all.iter().find(|entry| entry.is_final).map(|entry| entry.path.clone());
     for entry in all.iter().skip(KEPT).filter(|entry| Some(&entry.path) != newest_final.as_ref()) {
-        if let Err(error) = fs::remove_file(&entry.path) {
+        if let Err(error) = storage::of(&entry.path).remove_file(&entry.path) {
             tracing::warn!(path = %entry.path.display(), %error, "cannot remove an old checkpoint");
         }
     }
@@ -192,7 +193,7 @@ pub fn newest(folder: &Path, only_final: bool) -> Option<Checkpoint> {
 /// Removes checkpoints within a round, which were of a round that is not wanted any more.
 pub fn remove_live(folder: &Path) {
     for entry in list(folder).into_iter().filter(|entry| !entry.is_final) {
-        if let Err(error) = fs::remove_file(&entry.path) {
+        if let Err(error) = storage::of(&entry.path).remove_file(&entry.path) {
             tracing::warn!(path = %entry.path.display(), %error, "cannot remove a checkpoint");
         }
     }

@@ -207,6 +207,8 @@ pub struct PlannerConfig {
     pub command_deadline_s: f64,
     /// Longest time without progress of training or scoring, seconds.
     pub service_deadline_s: f64,
+    /// Longest wait in the air for a disk that refuses the journal, seconds; then the vehicle comes home.
+    pub disk_patience_s: f64,
 }
 
 impl Default for PlannerConfig {
@@ -267,6 +269,7 @@ impl Default for PlannerConfig {
             capture_attempts: 2,
             command_deadline_s: 30.0,
             service_deadline_s: 120.0,
+            disk_patience_s: 30.0,
         }
     }
 }
@@ -350,6 +353,7 @@ impl Section for PlannerConfig {
             ("capture_attempts", f64::from(self.capture_attempts), 1.0, 10.0),
             ("command_deadline_s", self.command_deadline_s, 1.0, 600.0),
             ("service_deadline_s", self.service_deadline_s, 1.0, 1e5),
+            ("disk_patience_s", self.disk_patience_s, 0.0, 600.0),
         ];
         let mut problems: Vec<Problem> = numbers
             .iter()

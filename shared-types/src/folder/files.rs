@@ -3,13 +3,14 @@
 //! The name aside carries the writer's process id and start time, so that what a dead writer left is told from what a
 //! living one is writing, and removed by the next writer in that folder.
 
-use std::fs::{self, File, OpenOptions};
-use std::io::{self, ErrorKind, Write as _};
+use std::fs;
+use std::io::{self, ErrorKind};
 use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use super::FolderError;
+use crate::storage::{self, WriteFile};
 
 const ASIDE: &str = ".tmp-";
 
@@ -23,7 +24,7 @@ pub fn write_atomic(path: &Path, bytes: &[u8]) -> Result<(), FolderError> {
     clean_leftovers(parent)?;
     let aside = aside_name(path);
     let written = write_durable(&aside, path, bytes)
-        .and_then(|()| fs::rename(&aside, path).map_err(|source| io_error("rename a new file to", path, source)));
+        .and_then(|()| rename(&aside, path).map_err(|source| io_error("rename a new file to", path, source)));
     if written.is_err() {
         remove_quietly(&aside);
     }
@@ -42,7 +43,7 @@ pub fn write_dir_atomic(path: &Path, files: &[(&str, &[u8])]) -> Result<(), Fold
             return Err(FolderError::Exists { path: path.to_owned() });
         }
         // A non-empty folder that appeared since is not replaced by rename(2): it answers ENOTEMPTY or EEXIST.
-        fs::rename(aside, path).map_err(|source| match source.kind() {
+        rename(aside, path).map_err(|source| match source.kind() {
             ErrorKind::DirectoryNotEmpty | ErrorKind::AlreadyExists => FolderError::Exists { path: path.to_owned() },
             _ => io_error("rename a new folder to", path, source),
         })
@@ -59,10 +60,9 @@ pub fn replace_dir_atomic(path: &Path, files: &[(&str, &[u8])]) -> Result<(), Fo
         return write_dir_atomic(path, files);
     }
     build_dir(path, files, |aside| {
-        let here = rustix::fs::CWD;
-        rustix::fs::renameat_with(here, aside, here, path, rustix::fs::RenameFlags::EXCHANGE)
-            .map_err(|errno| io_error("exchange with a new folder", path, errno.into()))?;
-        fs::remove_dir_all(aside).map_err(|source| io_error("remove the old version of", path, source))
+        let disk = storage::of(path);
+        disk.exchange(aside, path).map_err(|source| io_error("exchange with a new folder", path, source))?;
+        disk.remove_dir_all(aside).map_err(|source| io_error("remove the old version of", path, source))
     })
 }
 
@@ -83,7 +83,8 @@ pub fn clean_leftovers(folder: &Path) -> Result<(), FolderError> {
         }
         let path = entry.path();
         let is_dir = entry.file_type().is_ok_and(|kind| kind.is_dir());
-        let removed = if is_dir { fs::remove_dir_all(&path) } else { fs::remove_file(&path) };
+        let disk = storage::of(&path);
+        let removed = if is_dir { disk.remove_dir_all(&path) } else { disk.remove_file(&path) };
         match removed {
             Ok(()) => tracing::info!(path = %path.display(), "removed what a dead writer left"),
             // Another process cleans the same folder.
@@ -94,8 +95,11 @@ pub fn clean_leftovers(folder: &Path) -> Result<(), FolderError> {
     Ok(())
 }
 
-/// Makes a folder and those above it, and brings every new entry to the disk.
-pub(super) fn create_dir_durable(path: &Path) -> Result<(), FolderError> {
+/// Makes a folder and those above it where they are not there, and brings every new entry to the disk.
+///
+/// # Errors
+/// [`FolderError::Full`] or [`FolderError::Io`], naming the folder that cannot be made.
+pub fn create_dir_durable(path: &Path) -> Result<(), FolderError> {
     if path.is_dir() {
         return Ok(());
     }
@@ -103,10 +107,10 @@ pub(super) fn create_dir_durable(path: &Path) -> Result<(), FolderError> {
     if let Some(parent) = parent {
         create_dir_durable(parent)?;
     }
-    match fs::create_dir(path) {
+    match storage::of(path).create_dir(path) {
         Ok(()) => {}
         Err(error) if error.kind() == ErrorKind::AlreadyExists && path.is_dir() => {}
-        Err(source) => return Err(io_error("make the folder", path, source)),
+        Err(source) => return Err(refused("make the folder", path, 0, source)),
     }
     parent.map_or(Ok(()), sync_dir)
 }
@@ -122,14 +126,14 @@ fn build_dir(
     let aside = aside_name(path);
     let built = fill_dir(&aside, path, files).and_then(|()| put_in_place(&aside));
     if built.is_err() {
-        fs::remove_dir_all(&aside).ok();
+        storage::of(path).remove_dir_all(&aside).ok();
     }
     built?;
     sync_dir(parent)
 }
 
 fn fill_dir(aside: &Path, path: &Path, files: &[(&str, &[u8])]) -> Result<(), FolderError> {
-    fs::create_dir(aside).map_err(|source| refused("make the folder", path, 0, source))?;
+    storage::of(path).create_dir(aside).map_err(|source| refused("make the folder", path, 0, source))?;
     for (name, bytes) in files {
         write_durable(&aside.join(name), &path.join(name), bytes)?;
     }
@@ -138,29 +142,28 @@ fn fill_dir(aside: &Path, path: &Path, files: &[(&str, &[u8])]) -> Result<(), Fo
 
 /// Writes and fsyncs a file that does not exist yet; errors name `shown`, the place it is meant for.
 fn write_durable(aside: &Path, shown: &Path, bytes: &[u8]) -> Result<(), FolderError> {
-    let mut file = OpenOptions::new()
-        .write(true)
-        .create_new(true)
-        .open(aside)
-        .map_err(|source| refused("create", shown, bytes.len(), source))?;
-    fill(&mut file, shown, bytes)
+    let mut file = storage::of(aside).create(aside).map_err(|source| refused("create", shown, bytes.len(), source))?;
+    fill(&mut *file, shown, bytes)
 }
 
-fn fill(file: &mut File, shown: &Path, bytes: &[u8]) -> Result<(), FolderError> {
-    file.write_all(bytes).map_err(|source| refused("write", shown, bytes.len(), source))?;
-    file.sync_all().map_err(|source| refused("bring to the disk", shown, bytes.len(), source))
+fn fill(file: &mut dyn WriteFile, shown: &Path, bytes: &[u8]) -> Result<(), FolderError> {
+    file.write(bytes).map_err(|source| refused("write", shown, bytes.len(), source))?;
+    file.sync().map_err(|source| refused("bring to the disk", shown, bytes.len(), source))
 }
 
 fn sync_dir(path: &Path) -> Result<(), FolderError> {
-    File::open(path).and_then(|dir| dir.sync_all()).map_err(|source| io_error("bring to the disk", path, source))
+    storage::of(path).sync_dir(path).map_err(|source| io_error("bring to the disk", path, source))
+}
+
+fn rename(from: &Path, to: &Path) -> io::Result<()> {
+    storage::of(to).rename(from, to)
 }
 
 fn refused(action: &'static str, path: &Path, bytes: usize, source: io::Error) -> FolderError {
-    match source.kind() {
-        ErrorKind::StorageFull | ErrorKind::QuotaExceeded | ErrorKind::FileTooLarge => {
-            FolderError::Full { path: path.to_owned(), bytes: bytes as u64, source }
-        }
-        _ => io_error(action, path, source),
+    if storage::is_full(&source) {
+        FolderError::Full { path: path.to_owned(), bytes: bytes as u64, source }
+    } else {
+        io_error(action, path, source)
     }
 }
 
@@ -178,7 +181,7 @@ fn parent_of(path: &Path) -> Result<&Path, FolderError> {
 
 fn remove_quietly(path: &Path) {
     // The first error is the one worth telling; a leftover is removed by the next writer.
-    fs::remove_file(path).ok();
+    storage::of(path).remove_file(path).ok();
 }
 
 fn aside_name(path: &Path) -> PathBuf {
@@ -211,6 +214,8 @@ fn start_of(pid: u32) -> Option<u64> {
 
 #[cfg(test)]
 mod tests {
+    use std::fs::OpenOptions;
+
     use super::*;
 
     fn names(folder: &Path) -> Vec<String> {

@@ -16,10 +16,11 @@ pub mod files;
 pub mod keyframe;
 mod png_file;
 
-pub use files::{clean_leftovers, write_atomic, write_dir_atomic};
+pub use files::{clean_leftovers, create_dir_durable, write_atomic, write_dir_atomic};
 pub use keyframe::{Exposure, Frame, Gate, Keyframe};
 
 use crate::messages::KeyframeReason;
+use crate::storage;
 
 /// What can go wrong with a mission folder. Every variant names the file.
 #[derive(Debug, thiserror::Error)]
@@ -35,7 +36,7 @@ pub enum FolderError {
         source: std::io::Error,
     },
     /// No room for a file; nothing of it was left behind.
-    #[error("no room for {path} ({bytes} bytes): free disk space, or choose another output folder: {source}")]
+    #[error("no room for {bytes} bytes of {path}: free disk space, or choose another output folder ({source})")]
     Full {
         /// The file that does not fit.
         path: PathBuf,
@@ -112,7 +113,7 @@ impl MissionFolder {
     pub fn create_with(root: impl AsRef<Path>, config: &str) -> Result<Self, FolderError> {
         let folder = Self::vacant(root.as_ref())?;
         let fresh = !folder.root.exists();
-        let made = files::create_dir_durable(&folder.root)
+        let made = create_dir_durable(&folder.root)
             .and_then(|()| write_atomic(&folder.config_path(), config.as_bytes()))
             .and_then(|()| folder.make_subfolders());
         if let Err(error) = made {
@@ -120,7 +121,7 @@ impl MissionFolder {
             for sub in SUBFOLDERS {
                 std::fs::remove_dir(folder.root.join(sub)).ok();
             }
-            std::fs::remove_file(folder.config_path()).ok();
+            storage::of(&folder.root).remove_file(&folder.config_path()).ok();
             if fresh {
                 std::fs::remove_dir(&folder.root).ok();
             }
@@ -130,7 +131,7 @@ impl MissionFolder {
     }
 
     fn make_subfolders(&self) -> Result<(), FolderError> {
-        SUBFOLDERS.iter().try_for_each(|sub| files::create_dir_durable(&self.root.join(sub)))
+        SUBFOLDERS.iter().try_for_each(|sub| create_dir_durable(&self.root.join(sub)))
     }
 
     /// The folder of a mission that is yet to be made.

@@ -71,6 +71,9 @@ pub enum ServiceError {
     /// What the service was given cannot be used (a mesh, a setting): the same start would fail the same way.
     #[error("{0}")]
     Unusable(String),
+    /// Something that it needs is missing, such as room on the disk.
+    #[error("{0}")]
+    Missing(String),
     /// Something else; the text names it, what was expected, and the way out.
     #[error("{0}")]
     Other(String),

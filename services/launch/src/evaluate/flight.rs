@@ -99,7 +99,6 @@ pub fn read(folder: &MissionFolder) -> anyhow::Result<FlightRecord> {
 /// # Errors
 /// When the record cannot be read or written.
 pub fn write(folder: &MissionFolder, flight: &Flight) -> anyhow::Result<()> {
-    std::fs::create_dir_all(folder.report_path())?;
     let record = read(folder)?.with(flight);
     write_atomic(&path(folder), serde_json::to_string_pretty(&record)?.as_bytes())?;
     Ok(())

@@ -10,6 +10,9 @@ pub mod pictures;
 pub mod truth;
 pub mod views;
 
+#[cfg(test)]
+mod power_cuts;
+
 use std::path::Path;
 
 use anyhow::Context as _;
@@ -192,7 +195,6 @@ pub fn read_metrics(folder: &MissionFolder) -> anyhow::Result<Option<Metrics>> {
 /// # Errors
 /// When the file cannot be written.
 pub fn write_metrics(folder: &MissionFolder, metrics: &Metrics) -> anyhow::Result<()> {
-    std::fs::create_dir_all(folder.report_path())?;
     write_atomic(&folder.report_path().join("metrics.json"), to_json(metrics)?.as_bytes())?;
     Ok(())
 }

@@ -27,7 +27,6 @@ pub const DIRECTIONS: [(&str, DVec3); 4] =
 /// # Errors
 /// When a picture cannot be written.
 pub fn write(folder: &MissionFolder, truth: &Truth, gaussians: &Gaussians) -> anyhow::Result<()> {
-    std::fs::create_dir_all(folder.report_path())?;
     let mut engine = Engine::new(cores())?;
     let mut rendered = Rendered::default();
     let settings = RenderSettings::default();

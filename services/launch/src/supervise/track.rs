@@ -2,12 +2,12 @@
 //! all runs of a mission; no service reads it.
 
 use std::fmt::Write as _;
-use std::fs::OpenOptions;
-use std::io::Write as _;
 use std::path::{Path, PathBuf};
 
 use glam::DVec3;
+use shared_types::folder::create_dir_durable;
 use shared_types::messages::Truth;
+use shared_types::storage;
 
 /// Mission time between points.
 const PERIOD_NS: u64 = 50_000_000;
@@ -42,14 +42,20 @@ impl Track {
         if self.lines.is_empty() {
             return Ok(());
         }
-        std::fs::create_dir_all(report)?;
+        create_dir_durable(report).map_err(std::io::Error::other)?;
         let path = path(report);
-        let fresh = !path.exists();
-        let mut file = OpenOptions::new().create(true).append(true).open(path)?;
-        if fresh {
-            file.write_all(HEADING.as_bytes())?;
+        let before = std::fs::read(&path).unwrap_or_default();
+        let whole = before.iter().rposition(|byte| *byte == b'\n').map_or(0, |end| end + 1);
+        let disk = storage::of(&path);
+        let mut file = disk.append(&path)?;
+        if whole < before.len() {
+            // A run was cut off in the middle of a line.
+            file.cut(whole as u64)?;
         }
-        file.write_all(self.lines.as_bytes())
+        let heading = if whole == 0 { HEADING } else { "" };
+        file.write(format!("{heading}{}", self.lines).as_bytes())?;
+        file.sync()?;
+        disk.sync_dir(report)
     }
 }
 
@@ -57,12 +63,15 @@ fn path(report: &Path) -> PathBuf {
     report.join("track.csv")
 }
 
-/// The points of a mission; none when it was not simulated. A line cut by a full disk is left out.
+/// The points of a mission; none when it was not simulated. A line that was cut is left out: its last number may lack digits.
 #[must_use]
 pub fn read(report: &Path) -> Vec<DVec3> {
-    let text = std::fs::read_to_string(path(report)).unwrap_or_default();
-    text.lines()
+    let bytes = std::fs::read(path(report)).unwrap_or_default();
+    // Blocks that never reached the disk are zeros, and no text: the lines around them stand.
+    let text = String::from_utf8_lossy(&bytes);
+    text.split_inclusive('\n')
         .skip(1)
+        .filter_map(|line| line.strip_suffix('\n'))
         .filter_map(|line| {
             let numbers: Vec<f64> = line.split(',').map(str::parse).collect::<Result<_, _>>().ok()?;
             match numbers[..] {
@@ -81,6 +90,9 @@ pub fn length_m(points: &[DVec3]) -> f64 {
 
 #[cfg(test)]
 mod tests {
+    use std::fs::OpenOptions;
+    use std::io::Write as _;
+
     use super::*;
 
     #[test]
