@@ -74,7 +74,7 @@ pub fn exit_of(error: &anyhow::Error) -> Exit {
         }
         // Its own errors are shown as if they were the service's: they are not in the chain.
         match cause.downcast_ref::<ServiceError>() {
-            Some(ServiceError::Bus(_)) => return Exit::Missing,
+            Some(ServiceError::Bus(_) | ServiceError::Missing(_)) => return Exit::Missing,
             Some(ServiceError::Unusable(_)) => return Exit::Usage,
             Some(ServiceError::Other(_)) | None => {}
         }
@@ -105,6 +105,7 @@ mod tests {
         let service = |error: ServiceError| exit_of(&anyhow::Error::from(error).context("world cannot go on"));
         let bus = shared_types::bus::BusError::NoChunk { channel: "clock" };
         assert_eq!(service(ServiceError::Bus(bus)), Exit::Missing);
+        assert_eq!(service(ServiceError::Missing("no room for the journal".to_owned())), Exit::Missing);
         assert_eq!(service(ServiceError::Unusable("rock.obj: no triangles".to_owned())), Exit::Usage);
         assert_eq!(service(ServiceError::Other("a bug".to_owned())), Exit::Internal);
     }

@@ -300,13 +300,18 @@ fn finish(
     progress: &mut Progress,
     json: bool,
 ) -> anyhow::Result<Exit> {
-    evaluate::flight::write(folder, flight)?;
+    // A disk that is full now is told, and does not hide how the mission went.
+    if let Err(error) = evaluate::flight::write(folder, flight) {
+        say(&format!("vantage: the figures of this run are not kept: {error:#}"));
+    }
     progress.doing("measuring the model against held-out views");
     let metrics = evaluate::measure(folder, config, evaluate::Effort::of(config), None);
     progress.clear();
     match metrics {
         Ok(metrics) => {
-            evaluate::write_metrics(folder, &metrics)?;
+            if let Err(error) = evaluate::write_metrics(folder, &metrics) {
+                say(&format!("vantage: the metrics are not kept: {error:#}; `vantage evaluate` measures again"));
+            }
             let text = if json { evaluate::to_json(&metrics)? } else { summary::table(&metrics, folder.root()) };
             print(&text)?;
         }

@@ -28,6 +28,24 @@ pub struct Inputs {
     pub depths: Vec<DepthView>,
 }
 
+/// Depth images that are kept while no turn is taken.
+const MOST_DEPTHS: usize = 64;
+
+impl Inputs {
+    /// Takes in what came later.
+    pub fn absorb(&mut self, newer: Self) {
+        self.vehicle = newer.vehicle.or(self.vehicle);
+        self.commands.extend(newer.commands);
+        self.command_replies.extend(newer.command_replies);
+        self.capture_replies.extend(newer.capture_replies);
+        self.round_replies.extend(newer.round_replies);
+        self.score_replies.extend(newer.score_replies);
+        self.depths.extend(newer.depths);
+        let old = self.depths.len().saturating_sub(MOST_DEPTHS);
+        self.depths.drain(..old);
+    }
+}
+
 /// Where stored views are read from.
 pub trait Views {
     /// The stored view of a reason and a keyframe id, and whether its gate was missed; `None` when there is none.

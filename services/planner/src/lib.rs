@@ -3,9 +3,11 @@
 //! - [`logic`]: geometry and choice, pure;
 //! - [`journal`] and [`ledger`]: the decisions, and the state that they add up to;
 //! - [`mission`] and [`state`]: the state machine, which takes [`io::Inputs`] and gives [`io::Outputs`];
+//! - [`desk`]: where decisions wait for the disk;
 //! - [`ports`] and [`service`]: the channels, the mission folder, the loop.
 #![forbid(unsafe_code)]
 
+pub mod desk;
 pub mod io;
 pub mod journal;
 pub mod ledger;

@@ -1,5 +1,7 @@
 //! Every channel of the planner, and the translation between messages and the mission's plain data.
 
+use std::collections::BTreeMap;
+
 use shared_types::bus::{Bus, BusError, Client, Publisher, ReplyAddress, Server, Subscriber};
 use shared_types::channel::{
     AliveChannel, CaptureChannel, DepthChannel, MissionCommandChannel, MissionStateChannel, RoundChannel, ScoreChannel,
@@ -28,7 +30,9 @@ pub struct Ports {
     captures: Client<CaptureChannel>,
     rounds: Client<RoundChannel>,
     scores: Client<ScoreChannel>,
-    asking: Vec<ReplyAddress>,
+    /// Who waits for the answer to a command, by its number.
+    asking: BTreeMap<usize, ReplyAddress>,
+    commands: usize,
     answered: Vec<((u32, u64, u64), MissionReply)>,
     /// Messages received.
     pub received: u64,
@@ -55,7 +59,8 @@ impl Ports {
             captures: bus.client()?,
             rounds: bus.client()?,
             scores: bus.client()?,
-            asking: Vec::new(),
+            asking: BTreeMap::new(),
+            commands: 0,
             answered: Vec::new(),
             received: 0,
             sent: 0,
@@ -93,16 +98,18 @@ impl Ports {
                 });
             }
         }
-        self.asking.clear();
         while let Some(message) = self.orders.receive(now_ns)? {
             self.received += 1;
             let address = message.address();
             if let Some((_, reply)) = self.answered.iter().find(|(key, _)| *key == address.key()) {
                 let reply = *reply;
                 self.orders.reply(now_ns, &address, &reply, &[])?;
+            } else if self.asking.values().any(|asker| asker.key() == address.key()) {
+                // Sent again: its answer waits for the disk.
             } else if let Some(command) = MissionCommand::from_code(message.header().command) {
-                inputs.commands.push((self.asking.len(), command));
-                self.asking.push(address);
+                inputs.commands.push((self.commands, command));
+                self.asking.insert(self.commands, address);
+                self.commands += 1;
             } else {
                 let why = format!("no mission command has the code {}", message.header().command);
                 self.answer(now_ns, &address, Err(why))?;
@@ -183,7 +190,7 @@ impl Ports {
                 self.scores.finish(*id);
                 Ok(())
             }
-            Effect::Answer(number, answer) => match self.asking.get(*number).cloned() {
+            Effect::Answer(number, answer) => match self.asking.remove(number) {
                 Some(address) => self.answer(now_ns, &address, answer.clone()),
                 None => Ok(()),
             },

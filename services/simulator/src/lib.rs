@@ -71,7 +71,7 @@ impl SimulatorError {
     pub fn exit_code(&self) -> u8 {
         match self {
             Self::Ports(_) | Self::MembersMissing { .. } => 69,
-            Self::Service(ServiceError::Bus(_)) => 69,
+            Self::Service(ServiceError::Bus(_) | ServiceError::Missing(_)) => 69,
             Self::Service(ServiceError::Unusable(_)) => 64,
             Self::Service(ServiceError::Other(_)) => 70,
         }

@@ -195,8 +195,10 @@ impl Supervisor {
         record.deaths_ms.retain(|death| death + window > now_ms);
         record.deaths_ms.push(now_ms);
         let (deaths, heard) = (record.deaths_ms.len(), record.heard);
-        // Bad configuration or something missing: the same start would fail the same way.
-        let refuses = !(heard && self.ever_armed) && matches!(code, Some(64 | 69));
+        // Bad configuration or something missing: the same start would fail the same way. A planner whose journal finds no
+        // room leaves so once the vehicle stands.
+        let in_use = heard && if service == ServiceName::Planner { self.armed } else { self.ever_armed };
+        let refuses = !in_use && matches!(code, Some(64 | 69));
         // The simulator is the vehicle itself: a new one would stand on the ground at time zero.
         let vehicle_lost = service == ServiceName::Simulator && heard && !refuses;
         if refuses || vehicle_lost {

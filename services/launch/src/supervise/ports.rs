@@ -8,20 +8,23 @@ use shared_types::channel::{
 };
 use shared_types::config::{ClockMode, Config};
 use shared_types::messages::{
-    ClockTick, CommandRequest, MissionCommand, MissionRequest, MissionState, ScoreStatus, Truth, VehicleCommand,
-    VehicleState,
+    ClockTick, CommandRequest, MissionCommand, MissionRequest, MissionState, ScoreStatus, ServiceState, Truth,
+    VehicleCommand, VehicleState,
 };
+use shared_types::payload::unpack_text;
 use shared_types::system::System;
 
 use crate::clock::monotonic_ns;
 
 /// A service's health, as far as its supervisor needs it.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Word {
     /// Who.
     pub service: ServiceName,
     /// For how long its worker has had a job without progress, milliseconds.
     pub stalled_ms: u64,
+    /// What it lacks; empty where nothing.
+    pub lacks: String,
 }
 
 /// What was heard in one turn.
@@ -101,7 +104,9 @@ impl Ports {
         let now_ns = self.now_ns();
         while let Some(message) = self.health.receive(now_ns)? {
             let health = message.header();
-            let word = |service| Word { service, stalled_ms: health.stalled_ns / 1_000_000 };
+            let degraded = health.state == ServiceState::Degraded.code();
+            let lacks = if degraded { unpack_text(&health.last_error) } else { String::new() };
+            let word = |service| Word { service, stalled_ms: health.stalled_ns / 1_000_000, lacks };
             heard.services.extend(ServiceName::from_code(health.service).map(word));
         }
         while let Some(message) = self.missions.receive(now_ns)? {
@@ -122,7 +127,7 @@ impl Ports {
         while let Some(reply) = self.mission_commands.receive(now_ns)? {
             let id = reply.request_id();
             if reply.header().accepted == 0 {
-                let reason = shared_types::payload::unpack_text(&reply.header().reason);
+                let reason = unpack_text(&reply.header().reason);
                 tracing::warn!(%reason, "the planner refuses the command");
             }
             drop(reply);

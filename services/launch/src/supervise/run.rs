@@ -96,6 +96,7 @@ pub fn run(system: &System, config: &Config, starter: Starter, progress: &mut Pr
         outcome: None,
         last_words: None,
         armed: false,
+        lacking: BTreeMap::new(),
         track: Track::default(),
         score_ms: Vec::new(),
         at_the_end: None,
@@ -140,6 +141,8 @@ struct Run<'a> {
     outcome: Option<Outcome>,
     last_words: Option<String>,
     armed: bool,
+    /// What each service said that it lacks; empty where nothing.
+    lacking: BTreeMap<ServiceName, String>,
     track: Track,
     score_ms: Vec<f64>,
     /// Outs of the clock and restarts when the mission was over: what happens while everybody leaves is not its doing.
@@ -150,6 +153,7 @@ impl Run<'_> {
     fn turn(&mut self, config: &Config) -> anyhow::Result<()> {
         let heard = self.ports.receive()?;
         for word in heard.services {
+            self.tell_what_lacks(word.service, word.lacks);
             self.event(&Event::Heard(word.service));
             if word.stalled_ms > 0 {
                 self.event(&Event::Stalled(word.service, word.stalled_ms));
@@ -172,7 +176,9 @@ impl Run<'_> {
         }
         for (service, code, how) in self.children.reap() {
             if !self.supervisor.is_ending() || code != Some(0) {
-                let words = self.children.last_words(service).unwrap_or_default();
+                // What keeps a service waiting is why it ends; on a full disk, its log does not tell.
+                let lacked = self.lacking.get(&service).filter(|lacks| !lacks.is_empty()).cloned();
+                let words = lacked.or_else(|| self.children.last_words(service)).unwrap_or_default();
                 tracing::info!(%service, %how, %words, "a service ended");
                 if !self.supervisor.is_ending() {
                     self.progress
@@ -197,6 +203,16 @@ impl Run<'_> {
             self.memory.sample(&sizes);
         }
         Ok(())
+    }
+
+    /// Tells the user, in flight, what a service waits for, and that it waits no more. What only counts up is told once.
+    fn tell_what_lacks(&mut self, service: ServiceName, lacks: String) {
+        let known = self.lacking.insert(service, lacks.clone()).unwrap_or_default();
+        let words = |text: &str| text.replace(|c: char| c.is_ascii_digit(), "");
+        if self.armed && words(&known) != words(&lacks) {
+            let text = if lacks.is_empty() { "goes on" } else { &lacks };
+            self.progress.say(&format!("{service}: {text}"));
+        }
     }
 
     fn mission(&mut self, stamp_ns: u64, state: &MissionState) {

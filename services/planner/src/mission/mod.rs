@@ -186,6 +186,12 @@ impl Mission {
         }
     }
 
+    /// Takes no more views: the journal could not be written for too long, and px4-link has begun to bring the vehicle home.
+    pub fn come_home(&mut self) {
+        self.rejoin();
+        self.end(EndReason::ServiceFailed);
+    }
+
     /// One turn at mission time `now_ns`.
     pub fn step(&mut self, now_ns: u64, inputs: Inputs, views: &mut dyn Views) -> Outputs {
         self.now_ns = now_ns;

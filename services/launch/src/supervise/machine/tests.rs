@@ -60,6 +60,18 @@ fn run_out(supervisor: &mut Supervisor, mut now_ms: u64, mut actions: Vec<Action
 }
 
 #[test]
+fn a_planner_whose_journal_finds_no_room_is_started_again_in_the_air_and_not_on_the_ground() {
+    let mut supervisor = flying();
+    assert!(supervisor.step(1_000, &exit(Planner, Some(69))).is_empty());
+    assert_eq!(supervisor.step(1_200, &Event::Tick), [Action::Start(Planner)]);
+    supervisor.step(1_300, &Event::Disarmed);
+    let actions = supervisor.step(1_400, &exit(Planner, Some(69)));
+    let (stopped, outcome) = run_out(&mut supervisor, 1_400, actions);
+    assert_eq!(outcome, Outcome::Broken { service: Planner, code: Some(69), worked: false });
+    assert!(stopped.contains(&Keeper) && !stopped.contains(&Planner), "{stopped:?}");
+}
+
+#[test]
 fn the_others_start_without_the_keepers_word_after_a_while() {
     let mut supervisor = Supervisor::new(POLICY, &START_ORDER);
     supervisor.step(0, &Event::Begin);
