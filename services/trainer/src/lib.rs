@@ -18,7 +18,7 @@ pub mod state;
 pub mod untrained;
 pub mod worker;
 
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use anyhow::{Context as _, bail};
 use shared_types::config::Config;
@@ -26,7 +26,7 @@ use shared_types::config::trainer::DeclaredCost;
 use shared_types::folder::MissionFolder;
 use shared_types::messages::ServiceState;
 use shared_types::service::{Context, HealthReport, Service, ServiceError, Step, StopAnswer};
-use shared_types::{NS_PER_S, ns_from_s};
+use shared_types::{NS_PER_S, TICK_NS, ns_from_s};
 use splatting::Training;
 
 use crate::ports::{Outcome, Ports};
@@ -69,7 +69,17 @@ pub struct Trainer {
     checkpoint_period_ns: u64,
     asked_snapshot_ns: u64,
     asked_checkpoint_ns: u64,
+    no_room: Option<NoRoom>,
     last_error: String,
+}
+
+/// A round's end waits for room on the disk.
+#[derive(Debug)]
+struct NoRoom {
+    reason: String,
+    retry_ns: u64,
+    /// The present tick, and when it began on the wall's clock.
+    tick: (u64, Instant),
 }
 
 impl From<WorkerGone> for ServiceError {
@@ -126,6 +136,7 @@ impl Trainer {
             checkpoint_period_ns: ns_from_s(config.trainer.checkpoint_period_s),
             asked_snapshot_ns: 0,
             asked_checkpoint_ns: 0,
+            no_room: None,
             last_error: String::new(),
         })
     }
@@ -147,6 +158,9 @@ impl Trainer {
                 State::Training(running) => {
                     if now_ns < running.next_due_ns(self.slice_iterations) {
                         return Ok(Step::Done);
+                    }
+                    if let Some(step) = self.wait_for_room(now_ns) {
+                        return Ok(step);
                     }
                     self.ask(now_ns);
                     match self.worker.poll()? {
@@ -216,6 +230,25 @@ impl Trainer {
         Ok(true)
     }
 
+    /// The step of a tick in which a round's end waits for room; `None` where it does not, or is being written again.
+    fn wait_for_room(&mut self, now_ns: u64) -> Option<Step> {
+        let lockstep = self.lockstep;
+        let waiting = self.no_room.as_mut()?;
+        if now_ns >= waiting.retry_ns {
+            waiting.retry_ns = u64::MAX;
+            self.worker.retry();
+        }
+        if waiting.retry_ns == u64::MAX {
+            return None;
+        }
+        // Who frees the disk needs real time for it: simulated time keeps to the wall's meanwhile.
+        if waiting.tick.0 != now_ns {
+            waiting.tick = (now_ns, Instant::now());
+        }
+        let too_early = lockstep && waiting.tick.1.elapsed() < Duration::from_nanos(TICK_NS);
+        Some(if too_early { Step::Waiting } else { Step::Done })
+    }
+
     fn training_output(&mut self, now_ns: u64, running: Running, output: Output) -> Result<(), ServiceError> {
         match output {
             Output::Slice { progress, over, snapshot } => {
@@ -232,13 +265,23 @@ impl Trainer {
                 self.state = State::Training(Running { progress_ns, ..running })
                     .on(Event::Slice { iterations: progress.iterations, over });
             }
+            Output::NoRoom { reason } => {
+                if self.no_room.is_none() {
+                    tracing::error!(round = running.round, reason, "the end of a round waits for room on the disk");
+                }
+                self.no_room = Some(NoRoom { reason, retry_ns: now_ns + NS_PER_S, tick: (now_ns, Instant::now()) });
+            }
             Output::Finished { round, snapshot } => {
+                if self.no_room.take().is_some() {
+                    tracing::info!(round = running.round, "the end of a round is on the disk now");
+                }
                 self.progress = round.progress;
                 self.requests.finished.push(round);
                 self.final_snapshot = Some(snapshot);
                 self.state = self.state.on(Event::Finished);
             }
             Output::Failed { round, reason } => {
+                self.no_room = None;
                 tracing::error!(round, reason, "a training round cannot be run");
                 self.last_error.clone_from(&reason);
                 self.reply_to_all(now_ns, round, &Progress::default(), &Outcome::Failed { reason: &reason })?;
@@ -333,12 +376,22 @@ impl Service for Trainer {
     }
 
     fn health(&self) -> HealthReport {
+        let (skipped, why) = self.worker.skipped();
+        let trouble = match &self.no_room {
+            Some(waiting) => Some(waiting.reason.clone()),
+            None => (!why.is_empty()).then(|| format!("{skipped} checkpoints skipped: {why}")),
+        };
+        let state = match self.state {
+            State::Starting => ServiceState::Starting,
+            _ if trouble.is_some() => ServiceState::Degraded,
+            _ => ServiceState::Running,
+        };
         HealthReport {
-            state: if self.state == State::Starting { ServiceState::Starting } else { ServiceState::Running },
-            last_error: self.last_error.clone(),
+            state,
+            last_error: trouble.unwrap_or_else(|| self.last_error.clone()),
             received: self.ports.received,
             sent: self.ports.sent,
-            dropped: self.ports.dropped,
+            dropped: self.ports.dropped + skipped,
         }
     }
 

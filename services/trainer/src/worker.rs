@@ -5,13 +5,13 @@
 
 use std::collections::VecDeque;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, TryRecvError, sync_channel};
+use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-use shared_types::folder::write_atomic;
+use shared_types::folder::{FolderError, write_atomic};
 
 use splatting::BackendError;
 
@@ -23,6 +23,9 @@ use crate::session::{Session, SessionError, Snapshot};
 
 /// Results that may wait to be published: bounds how far the thread runs ahead of the mission clock, and its memory.
 const AHEAD: usize = 8;
+
+/// How often the thread looks whether it is to try again.
+const RETRY_POLL: Duration = Duration::from_millis(1);
 
 /// Slices that may wait for a snapshot to arrive.
 const HELD: usize = 4;
@@ -77,6 +80,11 @@ pub enum Output {
         /// The model.
         snapshot: Snapshot,
     },
+    /// A round is over, and no room for it on the disk: told again after each [`Worker::retry`] that finds none.
+    NoRoom {
+        /// What does not fit.
+        reason: String,
+    },
     /// A round cannot be run.
     Failed {
         /// Which.
@@ -99,7 +107,17 @@ struct Signals {
     stop: AtomicBool,
     snapshot: AtomicBool,
     checkpoint: AtomicBool,
+    retry: AtomicBool,
     work: AtomicU64,
+    /// Checkpoints within rounds that could not be written, and why the last could not; empty once one was.
+    skipped: AtomicU64,
+    trouble: Mutex<String>,
+}
+
+impl Signals {
+    fn tell(&self, trouble: String) {
+        *self.trouble.lock().unwrap_or_else(PoisonError::into_inner) = trouble;
+    }
 }
 
 /// The service's end.
@@ -175,6 +193,18 @@ impl Worker {
     /// Asks for a checkpoint after the next slice ([`Pace::OnDemand`]).
     pub fn ask_checkpoint(&self) {
         self.signals.checkpoint.store(true, Ordering::Relaxed);
+    }
+
+    /// Has it try again to write the end of a round for which there was no room.
+    pub fn retry(&self) {
+        self.signals.retry.store(true, Ordering::Relaxed);
+    }
+
+    /// Checkpoints within rounds that could not be written, and why not; no reason where the last one could.
+    #[must_use]
+    pub fn skipped(&self) -> (u64, String) {
+        let reason = self.signals.trouble.lock().unwrap_or_else(PoisonError::into_inner).clone();
+        (self.signals.skipped.load(Ordering::Relaxed), reason)
     }
 
     /// Counts real progress.
@@ -253,8 +283,10 @@ impl Thread {
             last_final.restore_into(&mut self.session);
             snapshot = self.session.snapshot();
             // A kill between a round's checkpoint and its model files leaves those of the round before: written again.
-            if let Some(round) = self.session.finished().last().map(|finished| finished.spec.round) {
-                self.write_models(round);
+            if let Some(round) = self.session.finished().last().map(|finished| finished.spec.round)
+                && let Err(error) = write_models(&self.model_folder, &self.session, round)
+            {
+                tracing::warn!(%error, "cannot write the model of a round; its checkpoint is written");
             }
         }
         if let Some(newest) = checkpoint::newest(&self.model_folder, false) {
@@ -293,10 +325,9 @@ impl Thread {
             self.session.finish()?;
         }
         // On disk before anybody hears of it.
-        if let Err(error) = checkpoint::write(&self.model_folder, &self.session) {
+        if let Err(error) = self.keep_round(round)? {
             return self.send(Output::Failed { round, reason: error.to_string() });
         }
-        self.write_models(round);
         match (self.session.finished().last().cloned(), self.session.snapshot()) {
             (Some(round), Some(snapshot)) => self.send(Output::Finished { round, snapshot }),
             _ => self.send(Output::Failed { round, reason: "the round left no result".to_owned() }),
@@ -384,16 +415,36 @@ impl Thread {
         }
     }
 
-    fn write_models(&self, round: u32) {
-        if let Err(error) = write_models(&self.model_folder, &self.session, round) {
-            tracing::warn!(error, "cannot write the model of a round; its checkpoint is written");
+    /// Brings a round's end to the disk: its checkpoint, then its model. Where there is no room it waits for some; whether
+    /// that takes too long is for the planner to say.
+    fn keep_round(&mut self, round: u32) -> Result<Result<(), FolderError>, End> {
+        loop {
+            let written = checkpoint::write(&self.model_folder, &self.session)
+                .and_then(|_path| write_models(&self.model_folder, &self.session, round));
+            let Err(error @ FolderError::Full { .. }) = written else {
+                // What was skipped within the round is in this.
+                self.signals.tell(String::new());
+                return Ok(written);
+            };
+            self.send(Output::NoRoom { reason: error.to_string() })?;
+            while !self.signals.retry.swap(false, Ordering::Relaxed) {
+                if self.signals.stop.load(Ordering::Relaxed) {
+                    return Err(End::Unwanted);
+                }
+                std::thread::sleep(RETRY_POLL);
+            }
         }
     }
 
     fn checkpoint(&mut self) -> Result<(), End> {
         self.synced()?;
-        if let Err(error) = checkpoint::write(&self.model_folder, &self.session) {
-            tracing::warn!(%error, "cannot write a checkpoint; training goes on");
+        match checkpoint::write(&self.model_folder, &self.session) {
+            Ok(_path) => self.signals.tell(String::new()),
+            Err(error) => {
+                let skipped = self.signals.skipped.fetch_add(1, Ordering::Relaxed) + 1;
+                tracing::warn!(%error, skipped, "a checkpoint is skipped; training goes on");
+                self.signals.tell(error.to_string());
+            }
         }
         Ok(())
     }
@@ -405,11 +456,15 @@ impl Thread {
 }
 
 /// Writes `rounds/07.ply` and `model.ply`.
-fn write_models(folder: &Path, session: &Session, round: u32) -> Result<(), String> {
+fn write_models(folder: &Path, session: &Session, round: u32) -> Result<(), FolderError> {
+    let path = folder.join("model.ply");
     let mut ply = Vec::new();
-    splatting::ply::write(session.model(), &mut ply).map_err(|error| error.to_string())?;
-    for path in [folder.join("rounds").join(format!("{round:02}.ply")), folder.join("model.ply")] {
-        write_atomic(&path, &ply).map_err(|error| error.to_string())?;
-    }
-    Ok(())
+    // Into memory: what it says then is of the model.
+    splatting::ply::write(session.model(), &mut ply).map_err(|error| FolderError::Io {
+        action: "make",
+        path: path.clone(),
+        source: std::io::Error::other(error),
+    })?;
+    write_atomic(&folder.join("rounds").join(format!("{round:02}.ply")), &ply)?;
+    write_atomic(&path, &ply)
 }

@@ -33,7 +33,7 @@ impl Core {
             self.last_error = error.to_string();
         }
         self.built = Some(keyframe);
-        let outcome = self.on(now_ns, Event::Stored(result.map_err(|error| error.to_string())));
+        let outcome = self.on(now_ns, Event::Stored(result.map_err(|error| format!("not stored: {error}"))));
         self.built = None;
         outcome
     }

@@ -8,7 +8,7 @@ use camera::ports::Ports;
 use camera::service::CameraService;
 use camera::sources::simulator::SimulatorSource;
 use glam::DVec3;
-use shared_types::config::CameraConfig;
+use shared_types::config::{CameraConfig, ClockMode};
 use shared_types::folder::{Keyframe, MissionFolder};
 use shared_types::frames::Intrinsics;
 use shared_types::messages::{CaptureReply, CaptureRequest, CaptureStatus, FrameView, ServiceState};
@@ -40,15 +40,15 @@ fn flight() -> Flight {
 }
 
 /// Fields are dropped in their order: the domain, last, removes what all others use.
-struct Rig {
+pub struct Rig {
     world: World,
-    others: Others,
-    service: CameraService,
+    pub others: Others,
+    pub service: CameraService,
     _context: Context,
-    folder: MissionFolder,
+    pub folder: MissionFolder,
     world_works: bool,
     at_view: u64,
-    k: u64,
+    pub k: u64,
     domain: Domain,
 }
 
@@ -60,9 +60,14 @@ fn start(domain: &Domain) -> (CameraService, Context) {
 }
 
 impl Rig {
-    fn new(root: &Path) -> Self {
+    pub fn new(root: &Path) -> Self {
+        Self::with_clock(root, ClockMode::Lockstep)
+    }
+
+    pub fn with_clock(root: &Path, clock: ClockMode) -> Self {
         let folder = MissionFolder::create(root.join("mission")).expect("folder");
         let mut domain = Domain::new(config());
+        domain.config.clock.mode = clock;
         domain.config.mission.folder = folder.root().display().to_string();
         let (world, others) = (World::new(&domain, flight()), Others::new(&domain));
         let (service, context) = start(&domain);
@@ -95,7 +100,15 @@ impl Rig {
         waits
     }
 
-    fn ticks_until_reply(&mut self, most: usize) -> (u64, CaptureReply) {
+    /// One turn of the loop on the wall's clock, which lets no tick wait.
+    pub fn tick_once(&mut self) {
+        let waits = self.tick();
+        assert_eq!(waits, 0, "the loop is held up");
+        self.world.work();
+        std::thread::sleep(Duration::from_millis(1));
+    }
+
+    pub fn ticks_until_reply(&mut self, most: usize) -> (u64, CaptureReply) {
         for _ in 0..most {
             self.tick();
             if let Some(reply) = self.others.reply(tick(self.k)) {
@@ -105,11 +118,11 @@ impl Rig {
         panic!("no reply within {most} ticks; the camera: {:?}", self.service);
     }
 
-    fn ask(&mut self, request_id: u64, request: &CaptureRequest) {
+    pub fn ask(&mut self, request_id: u64, request: &CaptureRequest) {
         self.others.ask(tick(self.k), request_id, request);
     }
 
-    fn keyframes_seen(&mut self) -> Vec<u64> {
+    pub fn keyframes_seen(&mut self) -> Vec<u64> {
         let mut seen = Vec::new();
         while let Some(message) = self.others.keyframes.receive(tick(self.k + 1)).expect("keyframes") {
             let view = FrameView::new(message.header(), message.items()).expect("a sane frame");

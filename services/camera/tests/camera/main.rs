@@ -5,3 +5,4 @@
 mod capture;
 mod common;
 mod conformance;
+mod disks;

@@ -16,13 +16,13 @@ use shared_types::system::System;
 use trainer::Trainer;
 use trainer::ports::Ports;
 
-struct Rig {
+pub struct Rig {
     system: System,
-    config: Config,
+    pub config: Config,
     planner: Bus,
     rounds: Client<RoundChannel>,
     snapshots: Subscriber<SnapshotChannel>,
-    tick: u64,
+    pub tick: u64,
     replies: Vec<(u64, RoundReply)>,
     published: Vec<(u64, SnapshotHeader, Vec<GaussianRow>)>,
     _base: tempfile::TempDir,
@@ -35,7 +35,7 @@ impl Drop for Rig {
 }
 
 impl Rig {
-    fn new(folder: &Path) -> Self {
+    pub fn new(folder: &Path) -> Self {
         let base = tempfile::tempdir_in("/dev/shm").unwrap();
         let system = System::create(base.path(), "trainer-test", 0).unwrap();
         let mut config = Config { model: model_config(), ..Config::default() };
@@ -55,18 +55,24 @@ impl Rig {
         }
     }
 
-    fn trainer(&self, incarnation: u64) -> Trainer {
-        let bus = Bus::open(&self.system, Limits::of(&self.config), ServiceName::Trainer, incarnation, true).unwrap();
-        Trainer::new(Ports::open(&bus).unwrap(), &self.config, true).unwrap()
+    pub fn trainer(&self, incarnation: u64) -> Trainer {
+        self.trainer_by(incarnation, true)
+    }
+
+    /// On the mission clock in lockstep, or on the wall's.
+    pub fn trainer_by(&self, incarnation: u64, lockstep: bool) -> Trainer {
+        let limits = Limits::of(&self.config);
+        let bus = Bus::open(&self.system, limits, ServiceName::Trainer, incarnation, lockstep).unwrap();
+        Trainer::new(Ports::open(&bus).unwrap(), &self.config, lockstep).unwrap()
     }
 
     /// Asks for round 0 with 100 iterations on four views.
-    fn ask(&mut self, request_id: u64) {
+    pub fn ask(&mut self, request_id: u64) {
         self.rounds.send(self.tick * TICK_NS, request_id, &request(0, 100), &[0, 2, 4, 6]).unwrap();
     }
 
     /// Grants `ticks` ticks, reading what is published as the planner would.
-    fn run(&mut self, trainer: &mut Trainer, ticks: u64) {
+    pub fn run(&mut self, trainer: &mut Trainer, ticks: u64) {
         for _ in 0..ticks {
             self.tick += 1;
             let now_ns = self.tick * TICK_NS;
@@ -88,13 +94,13 @@ impl Rig {
         }
     }
 
-    fn done(&self) -> Vec<(u64, RoundReply)> {
+    pub fn done(&self) -> Vec<(u64, RoundReply)> {
         let done = |reply: &&(u64, RoundReply)| reply.1.status == RoundStatus::Done.code();
         self.replies.iter().filter(done).copied().collect()
     }
 }
 
-fn mission() -> (tempfile::TempDir, MissionFolder) {
+pub fn mission() -> (tempfile::TempDir, MissionFolder) {
     let dir = tempfile::tempdir().unwrap();
     let folder = MissionFolder::create(dir.path()).unwrap();
     for view in training_views((WIDTH, HEIGHT)) {
