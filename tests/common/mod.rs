@@ -11,6 +11,8 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::time::{Duration, Instant};
 
+pub mod namespace;
+
 /// The binary under test.
 pub fn vantage() -> Command {
     Command::new(env!("CARGO_BIN_EXE_vantage"))
@@ -122,6 +124,29 @@ fn tell(log: &Path, folder: &Path) -> String {
         }
     }
     told
+}
+
+/// Stops a mission's processes where they are, all at once, while `look` looks.
+pub fn frozen<T>(flight: &Flight, look: impl FnOnce() -> T) -> T {
+    let pids: Vec<u32> = flight.services().into_values().chain([flight.pid()]).collect();
+    pids.iter().for_each(|pid| kill(*pid, "STOP"));
+    let seen = look();
+    pids.iter().for_each(|pid| kill(*pid, "CONT"));
+    seen
+}
+
+/// Copies a folder and all in it.
+pub fn copy_folder(from: &Path, to: &Path) {
+    fs::create_dir_all(to).expect("made");
+    for entry in fs::read_dir(from).expect("read") {
+        let entry = entry.expect("entry");
+        let (source, target) = (entry.path(), to.join(entry.file_name()));
+        if entry.file_type().expect("kind").is_dir() {
+            copy_folder(&source, &target);
+        } else {
+            fs::copy(&source, &target).expect("copied");
+        }
+    }
 }
 
 /// Sends a signal by name.
