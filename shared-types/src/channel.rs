@@ -6,7 +6,7 @@
 use crate::Payload;
 use crate::bus::Envelope;
 use crate::messages::{
-    Alive, CandidateScore, CandidateState, CandidateView, CaptureReply, CaptureRequest, ClockGrant, ClockTick,
+    Alive, CandidateScore, CandidateState, CandidateView, CaptureReply, CaptureRequest, Check, ClockGrant, ClockTick,
     CommandReply, CommandRequest, ControlReply, ControlRequest, FrameHeader, GaussianRow, Health, MissionReply,
     MissionRequest, MissionState, RenderReply, RenderRequest, RoundReply, RoundRequest, ScoreReply, ScoreRequest,
     SnapshotHeader, Truth, VehicleState, VehicleTarget, Waypoint,
@@ -71,8 +71,8 @@ pub trait Channel: 'static {
     const NAME: &'static str;
     /// Settings, from the table in this file.
     const SETTINGS: Settings;
-    /// The part of fixed size.
-    type Header: Payload + Default;
+    /// The part of fixed size, which knows what it and the items must be.
+    type Header: Payload + Default + Check<Self::Item>;
     /// What the slice is made of.
     type Item: Payload;
 

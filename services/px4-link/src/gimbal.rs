@@ -15,6 +15,10 @@ const YAW_IN_VEHICLE: u16 = 32;
 const YAW_IN_EARTH: u16 = 64;
 /// Roll and pitch relative to the horizon.
 const DEMAND_FLAGS: f32 = 12.0;
+/// No gimbal's limits are wider.
+const FULL_TURN_RAD: f64 = core::f64::consts::TAU;
+/// Least time between two attitudes from which a rate is taken, seconds.
+const LEAST_BETWEEN_S: f64 = 1e-3;
 const PERIOD_NS: u64 = 200_000_000;
 const REFRESH_NS: u64 = 2_000_000_000;
 /// Time without an answer, after everything else was answered, after which there is no gimbal.
@@ -73,7 +77,7 @@ impl Gimbal {
     /// Takes the manager's description.
     pub fn information(&mut self, message: &GIMBAL_MANAGER_INFORMATION_DATA) {
         let (low, high) = (f64::from(message.pitch_min), f64::from(message.pitch_max));
-        if low.is_finite() && high.is_finite() && low < high {
+        if low < high && low >= -FULL_TURN_RAD && high <= FULL_TURN_RAD {
             self.limits_rad = Some((low, high));
             self.device = message.gimbal_device_id;
         }
@@ -98,7 +102,10 @@ impl Gimbal {
             }
             #[expect(clippy::cast_precision_loss, reason = "milliseconds")]
             let dt_s = (stamp_ns - self.stamp_ns) as f64 * 1e-9;
-            self.rates_radps = if dt_s < 1.0 { turn.to_scaled_axis() / dt_s } else { DVec3::ZERO };
+            // Two stamps that are almost the same say nothing about a rate.
+            if dt_s > LEAST_BETWEEN_S {
+                self.rates_radps = if dt_s < 1.0 { turn.to_scaled_axis() / dt_s } else { DVec3::ZERO };
+            }
         }
         if stamp_ns >= self.stamp_ns {
             self.world_from_gimbal = world_from_gimbal;

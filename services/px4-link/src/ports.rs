@@ -47,7 +47,8 @@ impl Ports {
     pub fn receive(&mut self, now_ns: u64, core: &mut Core) -> Result<(), BusError> {
         while let Some(alive) = self.alive.receive(now_ns)? {
             self.received += 1;
-            core.on_alive(alive.sent_ns());
+            // A time that has not come would keep the planner alive for ever.
+            core.on_alive(alive.sent_ns().min(now_ns));
         }
         while let Some(request) = self.commands.receive(now_ns)? {
             self.received += 1;

@@ -4,6 +4,7 @@ use std::collections::VecDeque;
 
 use glam::{DQuat, DVec3};
 use mavlink::dialects::common::{MavLandedState, MavMessage, MavModeFlag, MavState, MavSysStatusSensor};
+use shared_types::messages::check::FARTHEST;
 use shared_types::messages::{ChargeState, FlightMode};
 
 use crate::frames::{EarthOrigin, WorldTransform, enu_from_flu, quaternion, swap_frd_flu, swap_ned_enu};
@@ -217,14 +218,14 @@ impl Telemetry {
                 // PX4 sends velocities in the frame that it names; 1 and 20 and 21 are local, the rest are the body's.
                 let local = matches!(m.child_frame_id as u32, 1 | 20 | 21);
                 let velocity = if local { velocity } else { attitude * velocity };
-                if !(position.is_finite() && velocity.is_finite()) {
+                if !(sane(position) && sane(velocity)) {
                     return;
                 }
                 let stamp_ns = self.stamp(now_ns, m.time_usec.saturating_mul(1000), sync);
                 self.odometry_ns = now_ns;
                 self.keep_attitude(stamp_ns, attitude);
                 let rates = DVec3::new(f64::from(m.rollspeed), f64::from(m.pitchspeed), f64::from(m.yawspeed));
-                if rates.is_finite() {
+                if sane(rates) {
                     self.body_rates_radps = swap_frd_flu(rates);
                 }
                 self.keep_fix(stamp_ns, position, velocity, Some(m.reset_counter), world);
@@ -235,7 +236,7 @@ impl Telemetry {
             {
                 let position = DVec3::new(f64::from(m.x), f64::from(m.y), f64::from(m.z));
                 let velocity = DVec3::new(f64::from(m.vx), f64::from(m.vy), f64::from(m.vz));
-                if position.is_finite() && velocity.is_finite() {
+                if sane(position) && sane(velocity) {
                     let stamp_ns = self.stamp(now_ns, u64::from(m.time_boot_ms) * 1_000_000, sync);
                     self.keep_fix(stamp_ns, position, velocity, None, world);
                 }
@@ -257,7 +258,7 @@ impl Telemetry {
             }
             MavMessage::HOME_POSITION(m) => {
                 let local = DVec3::new(f64::from(m.x), f64::from(m.y), f64::from(m.z));
-                if local.is_finite() {
+                if sane(local) {
                     self.home = Some((swap_ned_enu(local), f64::from(m.altitude) * 1e-3));
                 }
             }
@@ -286,7 +287,7 @@ impl Telemetry {
                 self.remote_control =
                     has(m.onboard_control_sensors_present, RC_BIT) && has(m.onboard_control_sensors_health, RC_BIT);
                 if self.battery_fraction < 0.0 && m.battery_remaining >= 0 {
-                    self.battery_fraction = f64::from(m.battery_remaining) / 100.0;
+                    self.battery_fraction = f64::from(m.battery_remaining.min(100)) / 100.0;
                 }
             }
             MavMessage::EXTENDED_SYS_STATE(m) => {
@@ -297,7 +298,7 @@ impl Telemetry {
             }
             MavMessage::BATTERY_STATUS(m) => {
                 if m.battery_remaining >= 0 {
-                    self.battery_fraction = f64::from(m.battery_remaining) / 100.0;
+                    self.battery_fraction = f64::from(m.battery_remaining.min(100)) / 100.0;
                 }
                 self.charge = match m.charge_state as u32 {
                     0 => ChargeState::Unknown,
@@ -309,7 +310,7 @@ impl Telemetry {
             }
             MavMessage::WIND_COV(m) => {
                 let wind = DVec3::new(f64::from(m.wind_x), f64::from(m.wind_y), f64::from(m.wind_z));
-                if wind.is_finite() {
+                if sane(wind) {
                     self.wind_mps = swap_ned_enu(wind);
                 }
             }
@@ -326,6 +327,11 @@ impl Telemetry {
             _ => {}
         }
     }
+}
+
+/// Whether a vector can be one of a vehicle: finite, and such as readers of `vehicle/state` believe.
+fn sane(vector: DVec3) -> bool {
+    vector.abs().max_element() <= FARTHEST && vector.is_finite()
 }
 
 /// Text of a fixed field of MAVLink, up to its first zero.

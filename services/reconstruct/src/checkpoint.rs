@@ -126,6 +126,7 @@ pub fn from_bytes(bytes: &[u8], run: u64) -> Result<State, CheckpointError> {
     let iteration = r.u32("iterations")?;
     let (random, views) = (r.u64("random state")?, r.u32("views")?);
     let left = r.list("view order", 4, |r| r.u32("a view"))?;
+    let order = ViewOrder::resume(random, views, left).ok_or(CheckpointError::Damaged)?;
     let recent_psnr_db = r.list("PSNRs", 8, |r| r.f64("a PSNR"))?.into();
     let rows = r.list("evaluations", Row::LEAST_BYTES, Row::read)?;
     let (cpu_s, wall_s) = (r.f64("processor time")?, r.f64("wall time")?);
@@ -145,7 +146,7 @@ pub fn from_bytes(bytes: &[u8], run: u64) -> Result<State, CheckpointError> {
         statistics,
         progression: Progression {
             iteration,
-            order: ViewOrder::resume(random, views, left),
+            order,
             recent_psnr_db,
             rows,
             cpu_s,

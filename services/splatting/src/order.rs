@@ -34,6 +34,9 @@ impl Random {
     }
 }
 
+/// Most views of an order that is resumed: a pass over all of them is a list in memory.
+const MOST_VIEWS: u32 = 1 << 22;
+
 /// Uniform replay over `views` views: every view once, in random order, before any comes again.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ViewOrder {
@@ -50,10 +53,12 @@ impl ViewOrder {
         Self { random: Random::new(seed), views, left: Vec::new() }
     }
 
-    /// An order that goes on where another stopped: its [`Random::state`], its views, and those left.
+    /// An order that goes on where another stopped: its [`Random::state`], its views, and those left. `None` where no order
+    /// can have stopped so: more views left than there are, one that there is not, or more than 4 million views.
     #[must_use]
-    pub fn resume(state: u64, views: u32, left: Vec<u32>) -> Self {
-        Self { random: Random::new(state), views, left }
+    pub fn resume(state: u64, views: u32, left: Vec<u32>) -> Option<Self> {
+        let fits = views <= MOST_VIEWS && left.len() <= views as usize && left.iter().all(|&view| view < views);
+        fits.then(|| Self { random: Random::new(state), views, left })
     }
 
     /// What [`ViewOrder::resume`] needs: state, views, views left.
@@ -101,10 +106,18 @@ mod tests {
             order.next_view();
         }
         let (state, views, left) = order.parts();
-        let mut resumed = ViewOrder::resume(state, views, left.to_vec());
+        let mut resumed = ViewOrder::resume(state, views, left.to_vec()).unwrap();
         for _ in 0..23 {
             assert_eq!(resumed.next_view(), order.next_view());
         }
+    }
+
+    #[test]
+    fn an_order_that_no_order_stopped_at_is_refused() {
+        assert!(ViewOrder::resume(1, 3, vec![2, 0]).is_some());
+        assert!(ViewOrder::resume(1, 3, vec![3]).is_none(), "a view that there is not");
+        assert!(ViewOrder::resume(1, 1, vec![0, 0]).is_none(), "more left than there are");
+        assert!(ViewOrder::resume(1, u32::MAX, Vec::new()).is_none(), "a list of 16 GB");
     }
 
     #[test]

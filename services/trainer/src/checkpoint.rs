@@ -39,10 +39,19 @@ pub enum CheckpointError {
     /// The checksum does not fit.
     #[error("its checksum does not fit its content: the file is damaged")]
     Damaged,
+    /// Numbers in it that contradict each other.
+    #[error("its {what} cannot be: the file is damaged")]
+    Impossible {
+        /// What the numbers are of.
+        what: &'static str,
+    },
     /// The model in it cannot be read.
     #[error("its model cannot be read: {0}")]
     Model(String),
 }
+
+/// Iterations of a mission and ids of Gaussians stay far below this; sums of them do not overflow.
+const MOST: u64 = 1 << 40;
 
 /// A checkpoint taken from disk.
 #[derive(Debug)]
@@ -112,8 +121,8 @@ pub fn from_bytes(bytes: &[u8]) -> Result<Checkpoint, CheckpointError> {
     if magic != MAGIC || version != VERSION {
         return Err(CheckpointError::Foreign { found: format!("{magic:#018x}, version {version}") });
     }
-    let (body, sum) = bytes.split_at(bytes.len() - 8);
-    if checksum(body).to_le_bytes() != sum {
+    let Some((body, sum)) = bytes.split_last_chunk::<8>() else { return Err(CheckpointError::Damaged) };
+    if checksum(body).to_le_bytes() != *sum || body.len() < 12 {
         return Err(CheckpointError::Damaged);
     }
     let mut r = Reader::new(&body[12..]);
@@ -121,6 +130,7 @@ pub fn from_bytes(bytes: &[u8]) -> Result<Checkpoint, CheckpointError> {
     let next_gaussian_id = r.u64("the next id")?;
     let inserted = r.list("keyframes", 8, |r| r.u64("a keyframe"))?;
     let finished = r.list("rounds", 100, FinishedRound::read)?;
+    let mut order_fits = true;
     let active = r.list("the round", 100, |r| {
         let spec = RoundSpec::read(r)?;
         let iterations = r.u32("iterations of the round")?;
@@ -129,10 +139,13 @@ pub fn from_bytes(bytes: &[u8]) -> Result<Checkpoint, CheckpointError> {
         let window = r.u32("the loss window")?;
         let losses = r.list("losses", 8, |r| r.f64("a loss"))?;
         let psnr_db = r.list("PSNRs", 8, |r| r.f64("a PSNR"))?.into();
+        // Views are counted among the round's keyframes.
+        let order = ViewOrder::resume(state, views, left).filter(|_| views as usize <= spec.keyframes.len());
+        order_fits &= order.is_some();
         Ok(ActiveRound {
             spec,
             iterations,
-            order: ViewOrder::resume(state, views, left),
+            order: order.unwrap_or_else(|| ViewOrder::new(state, 0)),
             losses: LossHistory::resume(window, &losses),
             psnr_db,
         })
@@ -142,6 +155,17 @@ pub fn from_bytes(bytes: &[u8]) -> Result<Checkpoint, CheckpointError> {
         let voxels = r.list("voxels", 16, |r| Ok(([r.i32("x")?, r.i32("y")?, r.i32("z")?], r.f32("a footprint")?)))?;
         Ok(VoxelGrid::from_entries(edge, voxels))
     })?;
+    let sane_grid = |grid: &VoxelGrid| grid.edge_m().is_finite() && grid.edge_m() > 0.0;
+    let generations = finished.iter().map(|round| round.generation).max().unwrap_or(0);
+    for (fits, what) in [
+        (order_fits, "view order"),
+        (total_iterations <= MOST && next_gaussian_id <= MOST && generations <= 4 * MOST, "count of iterations"),
+        (grid.iter().all(sane_grid), "voxel grid"),
+    ] {
+        if !fits {
+            return Err(CheckpointError::Impossible { what });
+        }
+    }
     let blob = r.blob("the model")?;
     let (model, optimiser) =
         splatting::checkpoint::decode(blob).map_err(|error| CheckpointError::Model(error.to_string()))?;

@@ -5,6 +5,9 @@ use shared_types::messages::RoundRequest;
 
 use splatting::bytes::{Reader, Truncated, Writer};
 
+/// Most iterations of a round: hours of training, in which no flight would wait for its end.
+const MOST_ITERATIONS: u32 = 1_000_000;
+
 /// What is asked of a round. Two requests are the same round if and only if these are equal.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RoundSpec {
@@ -62,6 +65,9 @@ impl RoundSpec {
         }
         if !(0.01..=100.0).contains(&spec.box_size_m) {
             return Err(format!("the box's edge is {} m; expected 0.01 to 100 m", spec.box_size_m));
+        }
+        if spec.max_iterations > MOST_ITERATIONS {
+            return Err(format!("{} iterations; expected at most {MOST_ITERATIONS}", spec.max_iterations));
         }
         if !(0.01..=100.0).contains(&spec.radius_m) {
             return Err(format!("the radius is {} m; expected 0.01 to 100 m", spec.radius_m));
@@ -196,6 +202,7 @@ mod tests {
         assert!(refused(request(), &[1, 2, 1]).contains("twice"));
         assert!(refused(RoundRequest { box_size_m: f64::NAN, ..request() }, &[1]).contains("NaN"));
         assert!(refused(RoundRequest { radius_m: -1.0, ..request() }, &[1]).contains("radius"));
+        assert!(refused(RoundRequest { max_iterations: u32::MAX, ..request() }, &[1]).contains("iterations"));
         assert!(refused(RoundRequest { ground_z_m: f64::INFINITY, ..request() }, &[1]).contains("ground"));
     }
 

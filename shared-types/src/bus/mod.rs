@@ -11,7 +11,7 @@ mod request;
 mod subscriber;
 mod wait;
 
-use std::cell::RefCell;
+use std::cell::{Cell, RefCell};
 use std::rc::{Rc, Weak};
 
 use iceoryx2::port::update_connections::UpdateConnections as _;
@@ -105,6 +105,8 @@ struct Inner {
     incarnation: u64,
     by_tick: bool,
     publishers: RefCell<Vec<Weak<dyn Serve>>>,
+    /// Messages that subscribers refused.
+    refused: Rc<Cell<u64>>,
 }
 
 /// A process's access to all channels of its system. Cheap to clone; stays on the thread that opened it.
@@ -146,7 +148,15 @@ impl Bus {
             .signal_handling_mode(SignalHandlingMode::Disabled)
             .create::<Ipc>()
             .map_err(|e| invalid(&e))?;
-        Ok(Self(Rc::new(Inner { node, limits, sender, incarnation, by_tick, publishers: RefCell::default() })))
+        Ok(Self(Rc::new(Inner {
+            node,
+            limits,
+            sender,
+            incarnation,
+            by_tick,
+            publishers: RefCell::default(),
+            refused: Rc::default(),
+        })))
     }
 
     /// Opens the sending end of a channel.
@@ -183,7 +193,7 @@ impl Bus {
             .subscriber_builder()
             .create()
             .map_err(|cause| BusError::Port { channel: C::NAME, cause: format!("{cause:?}") })?;
-        Ok(Subscriber::new(raw, self.0.by_tick && C::SETTINGS.by_tick))
+        Ok(Subscriber::new(raw, self.0.by_tick && C::SETTINGS.by_tick, Rc::clone(&self.0.refused)))
     }
 
     /// Opens a client of a request channel.
@@ -233,6 +243,12 @@ impl Bus {
     /// Cleans up after processes of this system that died.
     pub fn reap_the_dead(&self) -> u64 {
         self.0.node.try_cleanup_dead_nodes().cleanups
+    }
+
+    /// Messages that this process received and refused, on all channels: they could not be what their channel carries.
+    #[must_use]
+    pub fn refused(&self) -> u64 {
+        self.0.refused.get()
     }
 
     /// Who sends on this bus.

@@ -6,7 +6,7 @@ use iceoryx2::port::LoanError;
 use iceoryx2::service::port_factory::PortFactory as _;
 
 use super::error::BusError;
-use super::message::{Envelope, Framed};
+use super::message::{Envelope, Framed, seal};
 use super::wait::Notifier;
 use super::{Factory, Served};
 use crate::channel::Channel;
@@ -86,6 +86,24 @@ impl<C: Channel> Publisher<C> {
         len: usize,
         fill: impl FnOnce(&mut [C::Item]),
     ) -> Result<(), BusError> {
+        envelope.sequence = self.sequence;
+        envelope.incarnation = self.incarnation;
+        envelope.sender = self.sender.code();
+        self.write(len, fill, |items| {
+            envelope.seal = seal::<C>(&envelope, header, items);
+            Framed { envelope, header: *header }
+        })?;
+        self.sequence += 1;
+        Ok(())
+    }
+
+    /// Writes a message in place: the items first, then what goes before them.
+    fn write(
+        &mut self,
+        len: usize,
+        fill: impl FnOnce(&mut [C::Item]),
+        frame: impl FnOnce(&[C::Item]) -> Framed<C::Header>,
+    ) -> Result<(), BusError> {
         if len > self.limit {
             return Err(BusError::TooManyItems { channel: C::NAME, items: len, limit: self.limit });
         }
@@ -93,10 +111,6 @@ impl<C: Channel> Publisher<C> {
             LoanError::OutOfMemory | LoanError::ExceedsMaxLoans => BusError::NoChunk { channel: C::NAME },
             other => BusError::Send { channel: C::NAME, cause: format!("{other:?}") },
         })?;
-        envelope.sequence = self.sequence;
-        envelope.incarnation = self.incarnation;
-        envelope.sender = self.sender.code();
-        *loan.user_header_mut() = Framed { envelope, header: *header };
         let uninitialised = loan.payload_mut();
         #[expect(unsafe_code, reason = "the loan is filled in place instead of copied")]
         // SAFETY: the pointer and length are those of the loan's own slice; all bytes are zeroed before a reference to
@@ -106,15 +120,24 @@ impl<C: Channel> Publisher<C> {
             core::slice::from_raw_parts_mut(uninitialised.as_mut_ptr().cast::<C::Item>(), uninitialised.len())
         };
         fill(items);
+        *loan.user_header_mut() = frame(items);
         #[expect(unsafe_code, reason = "the loan is filled in place instead of copied")]
         // SAFETY: every item was initialised above.
         let loan = unsafe { loan.assume_init() };
         loan.send().map_err(|cause| BusError::Send { channel: C::NAME, cause: format!("{cause:?}") })?;
-        self.sequence += 1;
         if let Some(notifier) = &self.notifier {
             notifier.notify();
         }
         Ok(())
+    }
+
+    /// Sends what no service would: an envelope as it is given, without a seal. For tests of what readers do with it.
+    ///
+    /// # Errors
+    /// As [`Self::send_with`].
+    #[doc(hidden)]
+    pub fn send_wild(&mut self, envelope: Envelope, header: &C::Header, items: &[C::Item]) -> Result<(), BusError> {
+        self.write(items.len(), |to| to.copy_from_slice(items), |_| Framed { envelope, header: *header })
     }
 
     /// Readers that the channel has now: nothing need be made for nobody.

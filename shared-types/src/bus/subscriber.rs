@@ -1,6 +1,8 @@
 //! The receiving end of a channel.
 
-use std::collections::VecDeque;
+use std::cell::Cell;
+use std::collections::{BTreeSet, VecDeque};
+use std::rc::Rc;
 
 use iceoryx2::port::ReceiveError;
 
@@ -8,6 +10,7 @@ use super::Ipc;
 use super::error::BusError;
 use super::message::{Framed, Message};
 use crate::channel::Channel;
+use crate::messages::Fault;
 
 type RawSubscriber<C> =
     iceoryx2::port::subscriber::Subscriber<Ipc, [<C as Channel>::Item], Framed<<C as Channel>::Header>>;
@@ -16,6 +19,9 @@ type RawSubscriber<C> =
 ///
 /// A member of a lockstep clock sees only messages sent before its present tick, in the order (sent, sender, sequence), and
 /// keeps the rest: what another member sends in the same tick may or may not have arrived, and must not matter.
+///
+/// A message that cannot be what the channel carries ([`crate::messages::check`]) is never given out: it is counted, and
+/// told once for each field that was wrong.
 pub struct Subscriber<C: Channel> {
     raw: RawSubscriber<C>,
     kept: VecDeque<Message<C>>,
@@ -23,7 +29,18 @@ pub struct Subscriber<C: Channel> {
     received: u64,
     expected: std::collections::BTreeMap<(u32, u64), u64>,
     lost: u64,
+    /// Refused so far, by all subscribers of the process.
+    refused: Rc<Cell<u64>>,
+    /// Fields for which a refusal was told.
+    told: BTreeSet<&'static str>,
 }
+
+/// Senders whose counts are remembered; lives of processes beyond these are forgotten, and with them only what they lost.
+const MOST_SENDERS: usize = 64;
+/// Messages refused in a row before the reader gets its turn back: who floods a channel must not stop its readers.
+const MOST_REFUSED: usize = 256;
+/// A member of a lockstep clock is at most a tick ahead of another; a message from farther ahead gives way to others.
+const AHEAD_NS: u64 = 2 * crate::TICK_NS;
 
 impl<C: Channel> core::fmt::Debug for Subscriber<C> {
     fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
@@ -35,8 +52,17 @@ impl<C: Channel> core::fmt::Debug for Subscriber<C> {
 }
 
 impl<C: Channel> Subscriber<C> {
-    pub(super) fn new(raw: RawSubscriber<C>, by_tick: bool) -> Self {
-        Self { raw, kept: VecDeque::new(), by_tick, received: 0, expected: Default::default(), lost: 0 }
+    pub(super) fn new(raw: RawSubscriber<C>, by_tick: bool, refused: Rc<Cell<u64>>) -> Self {
+        Self {
+            raw,
+            kept: VecDeque::new(),
+            by_tick,
+            received: 0,
+            expected: Default::default(),
+            lost: 0,
+            refused,
+            told: BTreeSet::new(),
+        }
     }
 
     /// The next message, if there is one.
@@ -50,7 +76,7 @@ impl<C: Channel> Subscriber<C> {
             }
             return self.next();
         }
-        self.drain()?;
+        self.drain(now_ns)?;
         let due = self.kept.front().is_some_and(|message| message.sent_ns() < now_ns);
         Ok(if due { self.kept.pop_front() } else { None })
     }
@@ -92,37 +118,67 @@ impl<C: Channel> Subscriber<C> {
         self.lost
     }
 
-    fn drain(&mut self) -> Result<(), BusError> {
-        let before = self.kept.len();
-        while self.kept.len() < C::SETTINGS.queue + 1 {
-            match self.next()? {
-                Some(message) => self.kept.push_back(message),
-                None => break,
+    fn drain(&mut self, now_ns: u64) -> Result<(), BusError> {
+        let room = C::SETTINGS.queue + 1;
+        loop {
+            let before = self.kept.len();
+            while self.kept.len() < room {
+                match self.next()? {
+                    Some(message) => self.kept.push_back(message),
+                    None => break,
+                }
+            }
+            if self.kept.len() > before {
+                self.kept.make_contiguous().sort_by_key(|message| {
+                    let envelope = message.envelope();
+                    (envelope.sent_ns, envelope.sender, envelope.incarnation, envelope.sequence)
+                });
+            }
+            // What claims to come from the future waits for its time; it must not keep out what is of now.
+            let ahead = |message: &Message<C>| message.sent_ns() > now_ns.saturating_add(AHEAD_NS);
+            if self.kept.len() < room || !self.kept.back().is_some_and(ahead) {
+                return Ok(());
+            }
+            if let Some(message) = self.kept.pop_back() {
+                let found = message.sent_ns().to_string();
+                self.refuse(
+                    message.envelope().sender,
+                    &Fault { field: "sent_ns", found, expected: "a time that has come" },
+                );
             }
         }
-        if self.kept.len() > before {
-            self.kept.make_contiguous().sort_by_key(|message| {
-                let envelope = message.envelope();
-                (envelope.sent_ns, envelope.sender, envelope.incarnation, envelope.sequence)
-            });
-        }
-        Ok(())
     }
 
     fn next(&mut self) -> Result<Option<Message<C>>, BusError> {
-        match self.raw.receive() {
-            Ok(None) => Ok(None),
-            Ok(Some(raw)) => {
-                self.received += 1;
-                let message = Message::new(raw);
-                let envelope = *message.envelope();
-                let next = self.expected.entry((envelope.sender, envelope.incarnation)).or_insert(envelope.sequence);
-                self.lost += envelope.sequence.saturating_sub(*next);
-                *next = envelope.sequence + 1;
-                Ok(Some(message))
+        for _ in 0..MOST_REFUSED {
+            let message = match self.raw.receive() {
+                Ok(Some(raw)) => Message::new(raw),
+                Ok(None) | Err(ReceiveError::ExceedsMaxBorrows) => return Ok(None),
+                Err(cause) => return Err(BusError::Receive { channel: C::NAME, cause: format!("{cause:?}") }),
+            };
+            self.received += 1;
+            let envelope = *message.envelope();
+            if let Err(fault) = message.check() {
+                drop(message);
+                self.refuse(envelope.sender, &fault);
+                continue;
             }
-            Err(ReceiveError::ExceedsMaxBorrows) => Ok(None),
-            Err(cause) => Err(BusError::Receive { channel: C::NAME, cause: format!("{cause:?}") }),
+            let sender = (envelope.sender, envelope.incarnation);
+            if self.expected.len() >= MOST_SENDERS && !self.expected.contains_key(&sender) {
+                self.expected.clear();
+            }
+            let next = self.expected.entry(sender).or_insert(envelope.sequence);
+            self.lost = self.lost.saturating_add(envelope.sequence.saturating_sub(*next));
+            *next = envelope.sequence.saturating_add(1);
+            return Ok(Some(message));
+        }
+        Ok(None)
+    }
+
+    fn refuse(&mut self, sender: u32, fault: &Fault) {
+        self.refused.set(self.refused.get().saturating_add(1));
+        if self.told.insert(fault.field) {
+            tracing::warn!(channel = C::NAME, sender, %fault, "a message is refused; another process writes what it should not");
         }
     }
 }

@@ -7,7 +7,8 @@ use crate::channel::{
     AliveChannel, FrameChannel, GrantChannel, MissionStateChannel, RoundChannel, SnapshotChannel, VehicleTargetChannel,
 };
 use crate::messages::{
-    Alive, ClockGrant, FrameHeader, MissionState, RoundReply, RoundRequest, SnapshotHeader, VehicleTarget,
+    Alive, ClockGrant, FrameHeader, MissionState, RoundReply, RoundRequest, RoundStatus, SnapshotHeader, VehicleTarget,
+    Waypoint,
 };
 
 struct Domain {
@@ -86,13 +87,26 @@ fn a_late_joiner_gets_the_state_but_never_a_path() {
     assert!(targets.latest(2).expect("received").is_none());
 }
 
+fn frame(width: u32, height: u32) -> FrameHeader {
+    FrameHeader {
+        width,
+        height,
+        has_color: 1,
+        depth_unit_m: 0.001,
+        focal_px: [50.0; 2],
+        principal_px: [1.0; 2],
+        world_from_camera_xyzw: [0.0, 0.0, 0.0, 1.0],
+        ..FrameHeader::default()
+    }
+}
+
 #[test]
 fn a_frame_is_filled_in_place_and_a_wild_size_is_refused() {
     let domain = Domain::new();
     let bus = domain.join(ServiceName::Camera, false);
     let mut frames = bus.publisher::<FrameChannel>().expect("frames");
     let mut reader = domain.join(ServiceName::Command, false).subscriber::<FrameChannel>().expect("reader");
-    let header = FrameHeader { width: 64, height: 48, has_color: 1, ..FrameHeader::default() };
+    let header = frame(64, 48);
     let len = header.items_len();
     frames.send_with(1, 1, &header, len, |bytes| bytes[len - 1] = 77).expect("sent");
     let frame = reader.latest(2).expect("received").expect("a frame");
@@ -147,12 +161,13 @@ fn a_request_survives_a_server_that_comes_late_and_gets_its_own_replies() {
     assert_eq!((request.header().round, request.items()), (3, &[1, 2, 3][..]));
     assert_eq!(request.stamp_ns(), 10, "the first sending's time");
     let to = request.address();
-    server.reply(30, &to, &RoundReply { iterations: 8, ..RoundReply::default() }, &[]).expect("replied");
+    let progress = RoundReply { status: RoundStatus::Progress.code(), ..RoundReply::default() };
+    server.reply(30, &to, &RoundReply { iterations: 8, ..progress }, &[]).expect("replied");
     assert!(stranger.receive(40).expect("received").is_none(), "not the stranger's");
     let reply = client.receive(40).expect("received").expect("a reply");
     assert_eq!((reply.request_id(), reply.header().iterations), (42, 8));
     client.finish(42);
-    server.reply(50, &to, &RoundReply::default(), &[]).expect("replied");
+    server.reply(50, &to, &progress, &[]).expect("replied");
     assert!(client.receive(60).expect("received").is_none(), "finished requests get nothing");
 }
 
@@ -161,7 +176,7 @@ fn waiting_ends_with_a_message_and_not_before() {
     let domain = Domain::new();
     let mut frames = domain.join(ServiceName::Camera, false).publisher::<FrameChannel>().expect("frames");
     let listener = domain.join(ServiceName::Command, false).listener::<FrameChannel>().expect("listener");
-    let header = FrameHeader { width: 2, height: 2, ..FrameHeader::default() };
+    let header = frame(2, 2);
     frames.send_with(1, 1, &header, header.items_len(), |_| ()).expect("sent");
     let before = std::time::Instant::now();
     wait(&[&listener], &[], std::time::Duration::from_secs(20)).expect("woken");
@@ -223,9 +238,10 @@ fn a_swallowed_wake_up_costs_one_period_and_not_all_that_follow() {
             let (domain, sending) = (&domain, &sending);
             scope.spawn(move || {
                 let mut grants = domain.join(sender, false).publisher::<GrantChannel>().expect("publisher");
+                let grant = ClockGrant { service: sender.code(), pid: 1, ..ClockGrant::default() };
                 // Apart, so that nearly every one finds the listener drained and about to sleep.
                 for _ in 0..10_000 {
-                    grants.send(1, 1, &ClockGrant::default()).expect("sent");
+                    grants.send(1, 1, &grant).expect("sent");
                     std::thread::sleep(std::time::Duration::from_micros(20));
                 }
                 sending.fetch_sub(1, std::sync::atomic::Ordering::SeqCst);
@@ -236,12 +252,50 @@ fn a_swallowed_wake_up_costs_one_period_and_not_all_that_follow() {
         }
     });
     let mut grants = domain.join(ServiceName::Px4Link, false).publisher::<GrantChannel>().expect("publisher");
+    let grant = ClockGrant { service: ServiceName::Px4Link.code(), pid: 1, ..ClockGrant::default() };
     // What has come is taken, and a time that is over clears a mark that was left behind.
     (0..3).for_each(|_| wait(&[&listener], &[], std::time::Duration::from_millis(5)).expect("over"));
     for _ in 0..20 {
-        grants.send(1, 1, &ClockGrant::default()).expect("sent");
+        grants.send(1, 1, &grant).expect("sent");
         let before = std::time::Instant::now();
         wait(&[&listener], &[], std::time::Duration::from_secs(5)).expect("woken");
         assert!(before.elapsed() < std::time::Duration::from_secs(4), "woken by the message");
+    }
+}
+
+#[test]
+fn what_a_channel_cannot_carry_is_never_given_out_and_does_not_stop_what_it_can() {
+    let domain = Domain::new();
+    let bus = domain.join(ServiceName::Planner, true);
+    let mut targets = domain.join(ServiceName::Planner, false).publisher::<VehicleTargetChannel>().expect("targets");
+    let mut reader = bus.subscriber::<VehicleTargetChannel>().expect("reader");
+    let waypoint = Waypoint { speed_mps: 1.0, ..Waypoint::default() };
+    let good = VehicleTarget { id: 7, path_len: 1, ..VehicleTarget::default() };
+    targets.send_items(1, 1, &VehicleTarget { path_len: 9, ..good }, &[waypoint]).expect("a length that lies");
+    targets.send_items(1, 1, &good, &[Waypoint { yaw_rad: f64::NAN, ..waypoint }]).expect("no number");
+    targets.send_items(1, 99_000_000_000, &good, &[waypoint]).expect("from the future");
+    targets.send_wild(Envelope { sent_ns: 1, sender: 8, ..Envelope::default() }, &good, &[waypoint]).expect("no seal");
+    targets.send_items(1, 1, &good, &[waypoint]).expect("sent");
+    let message = reader.receive(2).expect("received").expect("the one that is right");
+    assert_eq!((message.header().id, message.items().len()), (7, 1));
+    assert!(reader.receive(2).expect("received").is_none());
+    assert_eq!(bus.refused(), 4);
+}
+
+#[test]
+fn messages_that_claim_to_come_from_the_future_do_not_keep_out_those_of_now() {
+    let domain = Domain::new();
+    let bus = domain.join(ServiceName::Px4Link, true);
+    let mut wild = domain.join(ServiceName::Command, false).publisher::<AliveChannel>().expect("wild");
+    let mut planner = domain.join(ServiceName::Planner, false).publisher::<AliveChannel>().expect("planner");
+    let mut reader = bus.subscriber::<AliveChannel>().expect("reader");
+    for turn in 0..100u64 {
+        for ahead in 0..3 {
+            wild.send((1000 + ahead + turn) * crate::NS_PER_S, 0, &Alive { sequence: 1 }).expect("sent");
+        }
+        let now_ns = turn * crate::TICK_NS;
+        planner.send(now_ns, now_ns, &Alive { sequence: 5 }).expect("sent");
+        let got = reader.receive(now_ns + 1).expect("received").map(|message| message.header().sequence);
+        assert_eq!(got, Some(5), "turn {turn}");
     }
 }

@@ -37,7 +37,7 @@ payload! {
         pub received: u64,
         /// Messages sent.
         pub sent: u64,
-        /// Messages lost by overflow or without a free chunk.
+        /// Messages lost by overflow or without a free chunk, or refused ([`super::check`]).
         pub dropped: u64,
         /// [`crate::ServiceName`] code.
         pub service: u32,

@@ -1,6 +1,7 @@
 //! The payload types of every channel, one file per subject.
 
 pub mod camera;
+pub mod check;
 pub mod clock;
 pub mod health;
 pub mod mission;
@@ -10,6 +11,7 @@ pub mod simulator;
 pub mod vehicle;
 
 pub use camera::{CaptureReply, CaptureRequest, CaptureStatus, FrameHeader, FrameView, KeyframeReason};
+pub use check::{Check, Fault};
 pub use clock::{ClockGrant, ClockTick, MAX_SERVICES};
 pub use health::{ControlCommand, ControlReply, ControlRequest, Health, ServiceState};
 pub use mission::{

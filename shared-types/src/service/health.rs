@@ -17,7 +17,7 @@ pub struct HealthReport {
     pub received: u64,
     /// Messages sent.
     pub sent: u64,
-    /// Messages lost or not sent.
+    /// Messages lost or not sent; those that the bus refused are added by the loop.
     pub dropped: u64,
 }
 
@@ -102,7 +102,7 @@ impl HealthSender {
             rss_bytes: resident_bytes(),
             received: report.received,
             sent: report.sent,
-            dropped: report.dropped,
+            dropped: report.dropped.saturating_add(context.bus.refused()),
             service: context.name.code(),
             pid: std::process::id(),
             state: state.code(),

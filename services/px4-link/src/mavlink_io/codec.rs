@@ -65,7 +65,7 @@ fn frame(bytes: &[u8]) -> Option<(usize, Option<Received>)> {
 }
 
 /// Takes the whole frames from the front of what a line has brought so far; a frame that is not whole yet stays.
-pub(super) fn take_frames(bytes: &mut Vec<u8>) -> Vec<Received> {
+pub fn take_frames(bytes: &mut Vec<u8>) -> Vec<Received> {
     let mut messages = Vec::new();
     let mut at = 0;
     while let Some(rest) = bytes.get(at..) {

@@ -16,7 +16,7 @@ use std::time::{Duration, Instant};
 
 use mavlink::dialects::common::{MavAutopilot, MavMessage};
 
-pub use codec::{Received, decode, encode};
+pub use codec::{Received, decode, encode, take_frames};
 use line::Line;
 
 /// The component that px4-link is: MAV_COMP_ID_ONBOARD_COMPUTER.

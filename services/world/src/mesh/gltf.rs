@@ -10,6 +10,8 @@ use gltf::mesh::Mode;
 
 use super::{Material, MeshError, RawMesh, images};
 
+/// Vertices of all nodes together: more would not fit beside the other processes.
+const MAX_VERTICES: usize = 50_000_000;
 /// Nodes nested deeper than this are a cycle or a bomb.
 const MAX_DEPTH: usize = 64;
 
@@ -41,6 +43,7 @@ pub(super) fn read(path: &Path, bytes: &[u8]) -> Result<RawMesh, MeshError> {
         document.materials().map(|material| base_color(path, &material, &buffers)).collect();
     materials.push(Material::Procedural);
     let mut parts = Parts { raw: RawMesh { materials, ..RawMesh::default() }, ..Parts::default() };
+    parts.unvisited = vec![true; document.nodes().len()];
     let scene = document.default_scene().or_else(|| document.scenes().next());
     let Some(scene) = scene else {
         return Err(malformed("no scene".to_owned(), "a scene with at least one mesh"));
@@ -64,7 +67,8 @@ fn resource(path: &Path, uri: &str) -> Result<Vec<u8>, MeshError> {
         });
     }
     let file = path.with_file_name(percent_decoded(uri));
-    std::fs::read(&file).map_err(|source| MeshError::Unreadable { path: file, source })
+    let bytes = images::check_beside(&file).and_then(|()| std::fs::read(&file));
+    bytes.map_err(|source| MeshError::Unreadable { path: file, source })
 }
 
 /// File names in URIs write blanks and other characters as %XX.
@@ -107,12 +111,24 @@ struct Parts {
     normals: Vec<[Vec3; 3]>,
     uvs: Vec<[Vec2; 3]>,
     missing_normals: bool,
+    /// Nodes that were not met yet.
+    unvisited: Vec<bool>,
+}
+
+/// What an accessor reads must lie in a buffer: one without a view is as many zeros as it likes.
+fn backed(accessor: Option<gltf::Accessor>) -> Result<(), String> {
+    let bare = accessor.filter(|accessor| accessor.view().is_none());
+    bare.map_or(Ok(()), |accessor| Err(format!("accessor {} has no buffer view", accessor.index())))
 }
 
 impl Parts {
     fn add_node(&mut self, node: &gltf::Node, parent: Mat4, buffers: &[Vec<u8>], depth: usize) -> Result<(), String> {
         if depth > MAX_DEPTH {
             return Err(format!("nodes are nested more than {MAX_DEPTH} deep"));
+        }
+        // Nodes are trees: with two ways to each of 64 levels, a small file would have more parts than memory holds.
+        if self.unvisited.get_mut(node.index()).is_none_or(|unvisited| !core::mem::take(unvisited)) {
+            return Err(format!("node {} has two parents", node.index()));
         }
         let transform = parent * Mat4::from_cols_array_2d(&node.transform().matrix());
         if let Some(mesh) = node.mesh() {
@@ -138,6 +154,10 @@ impl Parts {
         if unusable || matches!(primitive.mode(), Mode::Points | Mode::Lines | Mode::LineLoop | Mode::LineStrip) {
             return Ok(());
         }
+        for semantic in [gltf::Semantic::Positions, gltf::Semantic::Normals] {
+            backed(primitive.get(&semantic))?;
+        }
+        backed(primitive.indices())?;
         let reader = primitive.reader(|buffer| buffers.get(buffer.index()).map(Vec::as_slice));
         let positions: Vec<Vec3> =
             reader.read_positions().ok_or("positions outside their buffer")?.map(Vec3::from_array).collect();
@@ -147,9 +167,16 @@ impl Parts {
         };
         let normals: Option<Vec<Vec3>> = reader.read_normals().map(|normals| normals.map(Vec3::from_array).collect());
         let set = primitive.material().pbr_metallic_roughness().base_color_texture().map_or(0, |info| info.tex_coord());
+        backed(primitive.get(&gltf::Semantic::TexCoords(set)))?;
         let uvs: Option<Vec<Vec2>> =
             reader.read_tex_coords(set).map(|uvs| uvs.into_f32().map(Vec2::from_array).collect());
 
+        // A mesh may stand at many nodes.
+        if self.raw.positions.len() + positions.len() > MAX_VERTICES
+            || self.raw.triangles.len() + indices.len() > 3 * MAX_VERTICES
+        {
+            return Err(format!("more than {MAX_VERTICES} vertices, or triangles between them"));
+        }
         let base = self.raw.positions.len() as u32;
         let linear = Mat3::from_mat4(transform);
         let mirrored = linear.determinant() < 0.0;

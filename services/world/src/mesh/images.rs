@@ -10,9 +10,22 @@ use crate::texture::Texture;
 /// Larger images are refused: the decoded image and its mip chain would not fit beside the other processes.
 const MAX_SIDE_PX: u32 = 8192;
 
+/// Larger files beside a mesh are refused.
+const MAX_FILE_BYTES: u64 = 1 << 30;
+
+/// Whether a file that a mesh names may be read: a mesh of somebody else may name a device or a pipe, which has no end.
+pub(super) fn check_beside(file: &Path) -> std::io::Result<()> {
+    let known = std::fs::metadata(file)?;
+    if known.is_file() && known.len() <= MAX_FILE_BYTES {
+        return Ok(());
+    }
+    let found = format!("a file of 1 GiB at most was expected, not a folder, a device or {} bytes", known.len());
+    Err(std::io::Error::new(std::io::ErrorKind::InvalidInput, found))
+}
+
 /// The texture in a file, or the procedural albedo with a warning.
 pub(super) fn from_file(mesh: &Path, file: &Path) -> Material {
-    match std::fs::read(file) {
+    match check_beside(file).and_then(|()| std::fs::read(file)) {
         Ok(bytes) => from_bytes(mesh, &file.display().to_string(), &bytes),
         Err(error) => {
             tracing::warn!(mesh = %mesh.display(), texture = %file.display(), %error, "texture cannot be read; the object gets a procedural albedo");

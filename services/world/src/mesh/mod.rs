@@ -78,16 +78,24 @@ impl Mesh {
     /// is missing or broken is a warning, and the object gets a procedural albedo instead.
     pub fn load(path: &Path, placement: &Placement) -> Result<Self, MeshError> {
         let bytes = std::fs::read(path).map_err(|source| MeshError::Unreadable { path: path.to_owned(), source })?;
+        Self::from_bytes(path, &bytes, placement)
+    }
+
+    /// As [`Self::load`], of the bytes of a file. `path` names them, and is where files that they refer to are looked for.
+    ///
+    /// # Errors
+    /// As [`Self::load`].
+    pub fn from_bytes(path: &Path, bytes: &[u8], placement: &Placement) -> Result<Self, MeshError> {
         if bytes.is_empty() {
             return Err(MeshError::Empty { path: path.to_owned() });
         }
         let extension = path.extension().map(|e| e.to_string_lossy().to_ascii_lowercase()).unwrap_or_default();
         let (raw, native_up) = match extension.as_str() {
-            "obj" => (obj::read(path, &bytes)?, UpAxis::Z),
-            "ply" => (ply::read(path, &bytes)?, UpAxis::Z),
-            "stl" => (stl::read(path, &bytes)?, UpAxis::Z),
+            "obj" => (obj::read(path, bytes)?, UpAxis::Z),
+            "ply" => (ply::read(path, bytes)?, UpAxis::Z),
+            "stl" => (stl::read(path, bytes)?, UpAxis::Z),
             // The format's specification fixes y as up.
-            "gltf" | "glb" => (gltf::read(path, &bytes)?, UpAxis::Y),
+            "gltf" | "glb" => (gltf::read(path, bytes)?, UpAxis::Y),
             _ => return Err(MeshError::UnknownFormat { path: path.to_owned(), found: extension }),
         };
         Self::from_raw(path, raw, native_up, placement)

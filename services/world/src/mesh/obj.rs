@@ -17,7 +17,10 @@ pub(super) fn read(path: &Path, bytes: &[u8]) -> Result<RawMesh, MeshError> {
     let warnings = RefCell::new(Vec::new());
     let loaded = tobj::load_obj_buf(&mut &bytes[..], &OPTIONS, |file| {
         let file = folder.join(file);
-        tobj::load_mtl(&file).inspect_err(|error| warnings.borrow_mut().push((file.clone(), *error)))
+        let known = images::check_beside(&file).map_err(|_unreadable| LoadError::OpenFileFailed);
+        known
+            .and_then(|()| tobj::load_mtl(&file))
+            .inspect_err(|error| warnings.borrow_mut().push((file.clone(), *error)))
     });
     for (file, error) in warnings.into_inner() {
         tracing::warn!(mesh = %path.display(), material = %file.display(), %error, "material file cannot be read; its textures are left out");

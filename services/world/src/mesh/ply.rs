@@ -84,6 +84,11 @@ fn parse(path: &Path, bytes: &[u8]) -> Result<RawMesh, Fault> {
     let mut body = Body { encoding: header.encoding, rest: &bytes[header.length..] };
     let mut mesh = Builder::default();
     for element in &header.elements {
+        if element.properties.is_empty() && element.rows > 0 {
+            // Its rows would take no data: nothing would bound their number.
+            let found = format!("{} {}s without a property", element.rows, element.name);
+            return Err((found, "at least one property in each element"));
+        }
         let mut values = Vec::new();
         for row in 0..element.rows {
             mesh.begin_row();
