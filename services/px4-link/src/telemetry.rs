@@ -176,7 +176,7 @@ impl Telemetry {
     }
 
     fn stamp(&mut self, now_ns: u64, boot_ns: u64, sync: &mut TimeSync) -> u64 {
-        if boot_ns + 1_000_000_000 < self.last_boot_ns {
+        if boot_ns.saturating_add(1_000_000_000) < self.last_boot_ns {
             self.reboots += 1;
             self.attitudes.clear();
             sync.reset();

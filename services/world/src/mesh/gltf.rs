@@ -22,8 +22,12 @@ pub(super) fn read(path: &Path, bytes: &[u8]) -> Result<RawMesh, MeshError> {
         found: format!("glTF: {found}"),
         expected,
     };
-    let gltf::Gltf { document, blob } = gltf::Gltf::from_slice(bytes)
-        .map_err(|error| malformed(error.to_string(), "a valid glTF 2.0 file without compression extensions"))?;
+    const VALID: &str = "a valid glTF 2.0 file without compression extensions";
+    let gltf::Gltf { document, blob } =
+        gltf::Gltf::from_slice_without_validation(bytes).map_err(|error| malformed(error.to_string(), VALID))?;
+    let json = document.into_json();
+    check_positions(&json).map_err(|found| malformed(found, VALID))?;
+    let document = gltf::Document::from_json(json).map_err(|error| malformed(error.to_string(), VALID))?;
     let mut buffers = Vec::new();
     for buffer in document.buffers() {
         let data = match buffer.source() {
@@ -54,6 +58,16 @@ pub(super) fn read(path: &Path, bytes: &[u8]) -> Result<RawMesh, MeshError> {
             .map_err(|found| malformed(found, "triangles whose positions and indices lie inside their buffers"))?;
     }
     Ok(parts.finish())
+}
+
+/// Whether the accessors of all positions are there: the library's own validation takes that for granted.
+fn check_positions(json: &gltf::json::Root) -> Result<(), String> {
+    let positions = gltf::json::validation::Checked::Valid(gltf::Semantic::Positions);
+    let used = json.meshes.iter().flat_map(|mesh| &mesh.primitives).filter_map(|p| p.attributes.get(&positions));
+    match used.map(|index| index.value()).find(|&index| index >= json.accessors.len()) {
+        Some(index) => Err(format!("positions in accessor {index} of {}", json.accessors.len())),
+        None => Ok(()),
+    }
 }
 
 /// The bytes of a data URI or of a file beside the mesh.

@@ -175,6 +175,11 @@ fn check(path: &Path, raw: &RawMesh) -> Result<(), MeshError> {
     Ok(())
 }
 
+/// Extents that scaling and turning in single precision can take, in the file's unit.
+const LEAST_EXTENT: f32 = 1e-15;
+/// See [`LEAST_EXTENT`].
+const MOST_EXTENT: f32 = 1e15;
+
 /// Removes triangles without an area, keeping every per-triangle table in step.
 fn drop_degenerate(path: &Path, raw: &mut RawMesh) -> Result<(), MeshError> {
     let (low, high) = bounds_of(&raw.positions);
@@ -190,6 +195,15 @@ fn drop_degenerate(path: &Path, raw: &mut RawMesh) -> Result<(), MeshError> {
     let dropped = keep.iter().filter(|k| !**k).count();
     if dropped == raw.triangles.len() {
         return Err(MeshError::NoTriangles { path: path.to_owned(), vertices: raw.positions.len() });
+    }
+    if !(LEAST_EXTENT..=MOST_EXTENT).contains(&extent)
+        || !raw.positions.iter().all(|p| p.abs().max_element() <= MOST_EXTENT)
+    {
+        return Err(MeshError::Malformed {
+            path: path.to_owned(),
+            found: format!("an object {extent:e} units across, from {low} to {high}"),
+            expected: "one of 1e-15 to 1e15 units, no farther from the origin",
+        });
     }
     if dropped > 0 {
         tracing::debug!(mesh = %path.display(), dropped, "triangles without an area left out");

@@ -323,3 +323,34 @@ proptest::proptest! {
         }
     }
 }
+
+#[test]
+fn files_that_would_take_all_memory_or_time_are_refused() {
+    // Sixty levels of nodes with two ways to each: 2^60 parts in a few kilobytes.
+    let nodes: Vec<String> = (1..60).map(|next| format!(r#"{{"children":[{next},{next}]}}"#)).collect();
+    let bomb = format!(
+        r#"{{"asset":{{"version":"2.0"}},"scene":0,"scenes":[{{"nodes":[0]}}],"nodes":[{},{{}}]}}"#,
+        nodes.join(",")
+    );
+    let (_, text) = error_of("bomb.gltf", bomb);
+    assert!(text.contains("two parents"), "{text}");
+
+    let (_, text) = error_of("rows.ply", "ply\nformat ascii 1.0\nelement vertex 18446744073709551615\nend_header\n");
+    assert!(text.contains("without a property"), "{text}");
+
+    let (_, text) = error_of("huge.obj", "v 0 0 0\nv 3e38 0 0\nv 0 3e38 0\nf 1 2 3\n");
+    assert!(text.contains("units across") || text.contains("no triangle"), "{text}");
+
+    let lost = r#"{"asset":{"version":"2.0"},"scenes":[{"nodes":[0]}],"nodes":[{"mesh":0}],"meshes":[{"primitives":[{"attributes":{"POSITION":5}}]}]}"#;
+    let (_, text) = error_of("lost.gltf", lost);
+    assert!(text.contains("accessor 5 of 0"), "{text}");
+}
+
+#[test]
+fn a_mesh_that_names_a_device_reads_nothing_of_it() {
+    let folder = Folder::new();
+    let with_device = CUBE_OBJ.replace("mtllib cube.mtl", "mtllib /dev/zero");
+    assert_is_unit_cube(&load(&folder.write("device.obj", with_device)).expect("loads without its material"));
+    folder.write("cube.mtl", "newmtl paint\nmap_Kd /dev/zero\n");
+    assert_is_unit_cube(&load(&folder.write("texture.obj", CUBE_OBJ)).expect("loads without its texture"));
+}
