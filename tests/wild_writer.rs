@@ -13,7 +13,7 @@ use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-use bytemuck::{Zeroable as _, bytes_of, bytes_of_mut, cast_slice_mut};
+use bytemuck::{Zeroable as _, bytes_of_mut, cast_slice_mut};
 use common::{Flight, keyframes, metrics, system_of};
 use shared_types::ServiceName;
 use shared_types::bus::{Bus, Envelope, Limits, Publisher, Subscriber};
@@ -89,12 +89,11 @@ impl<C: Channel> Scribble for Port<C> {
             self.last = Some((*message.envelope(), *message.header(), kept));
         }
         // A full queue, or a channel whose chunks are all in use, is no failure of this test.
-        let sent = match random.below(3) {
+        let _sent = match random.below(3) {
             0 => self.random(random).map(|()| written.random += 1),
             1 => self.flipped(random).map(|()| written.flipped += 1),
             _ => self.senseless(random).map(|()| written.senseless += 1),
         };
-        drop(sent);
     }
 }
 
@@ -197,7 +196,6 @@ impl Nonsense {
             self.render.send(1, 1, &RenderRequest { width: u32::MAX, height: code, purpose: 1, ..Default::default() }),
             self.control.send(1, 1, &ControlRequest { command: code, service: 8, ..ControlRequest::default() }),
         ];
-        drop(sent);
     }
 }
 

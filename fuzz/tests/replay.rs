@@ -1,5 +1,7 @@
 //! The short run of every change: seeds, what was found before, and mutations from a fixed seed.
 
+#![allow(clippy::expect_used, clippy::panic, reason = "a test fails by panicking")]
+
 use fuzz::mutate::{Random, mutated};
 use fuzz::{TARGETS, Target, check, regressions};
 

@@ -4,7 +4,11 @@ use std::any::Any;
 
 use shared_types::bus::{Bus, BusError, Publisher, Subscriber};
 use shared_types::channel::{Channel, ChannelVisitor, HealthChannel, HealthLastChannel, visit_all};
+use shared_types::fault_point;
 use shared_types::messages::Health;
+
+/// About half of the channels.
+const HALF: usize = 14;
 
 pub(crate) struct Ports {
     health: Subscriber<HealthChannel>,
@@ -22,7 +26,12 @@ impl ChannelVisitor for HoldAll<'_> {
     fn visit<C: Channel>(&mut self) {
         if let Ok(held) = &mut self.held {
             match self.bus.hold::<C>() {
-                Ok(channel) => held.push(channel),
+                Ok(channel) => {
+                    held.push(channel);
+                    if held.len() == HALF {
+                        fault_point::reach("channels", "half-open");
+                    }
+                }
                 Err(error) => self.held = Err(error),
             }
         }

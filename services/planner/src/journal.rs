@@ -6,6 +6,7 @@
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
+use shared_types::fault_point;
 use shared_types::messages::{EndReason, KeyframeReason, VehicleCommand};
 use shared_types::storage::{self, WriteFile};
 
@@ -302,8 +303,10 @@ impl Journal {
         if self.torn {
             self.mend().map_err(|source| io("repair", source))?;
         }
+        fault_point::reach("journal", "unwritten");
         match self.file.write(text.as_bytes()).and_then(|()| self.file.sync()) {
             Ok(()) => {
+                fault_point::reach("journal", "appended");
                 self.good += text.len() as u64;
                 Ok(())
             }

@@ -124,6 +124,7 @@ impl<C: Channel> Publisher<C> {
         #[expect(unsafe_code, reason = "the loan is filled in place instead of copied")]
         // SAFETY: every item was initialised above.
         let loan = unsafe { loan.assume_init() };
+        crate::fault_point::reach("loan", C::NAME);
         loan.send().map_err(|cause| BusError::Send { channel: C::NAME, cause: format!("{cause:?}") })?;
         if let Some(notifier) = &self.notifier {
             notifier.notify();

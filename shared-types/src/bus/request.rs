@@ -204,6 +204,7 @@ impl<R: RequestChannel> Server<R> {
         len: usize,
         fill: impl FnOnce(&mut [ItemOf<R::Reply>]),
     ) -> Result<(), BusError> {
+        crate::fault_point::reach("reply", R::Reply::NAME);
         let envelope = Envelope {
             stamp_ns: now_ns,
             sent_ns: now_ns,

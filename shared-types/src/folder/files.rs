@@ -10,6 +10,7 @@ use std::sync::OnceLock;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use super::FolderError;
+use crate::fault_point;
 use crate::storage::{self, WriteFile};
 
 const ASIDE: &str = ".tmp-";
@@ -156,7 +157,10 @@ fn sync_dir(path: &Path) -> Result<(), FolderError> {
 }
 
 fn rename(from: &Path, to: &Path) -> io::Result<()> {
-    storage::of(to).rename(from, to)
+    fault_point::reach("file", "unrenamed");
+    storage::of(to).rename(from, to)?;
+    fault_point::reach("file", "renamed");
+    Ok(())
 }
 
 fn refused(action: &'static str, path: &Path, bytes: usize, source: io::Error) -> FolderError {

@@ -3,6 +3,7 @@
 use glam::DVec3;
 use shared_types::bus::ReplyAddress;
 use shared_types::config::link::ArmMode;
+use shared_types::fault_point;
 use shared_types::messages::{
     CommandReply, CommandRequest, CommandStatus, Commander, FailsafeReason, FlightMode, TargetStatus, VehicleCommand,
     VehicleTarget, Waypoint,
@@ -254,6 +255,11 @@ impl Core {
                 if let Some(Running { procedure, address }) = self.running.take()
                     && let Some(address) = address
                 {
+                    match procedure.command {
+                        VehicleCommand::Arm => fault_point::reach("vehicle", "armed"),
+                        VehicleCommand::TakeControl => fault_point::reach("vehicle", "offboard"),
+                        _ => {}
+                    }
                     self.answer(address, reply(procedure.command, CommandStatus::Confirmed, ""));
                 }
             }
