@@ -36,7 +36,7 @@ impl OnSmallDisk {
         let seen = namespace.seen(&folder);
         let mut flight = Flight::spawn(&base.path().join("mission"), command);
         flight.folder = seen.clone();
-        Some(Self { flight, namespace, disk, folder: seen, base: base })
+        Some(Self { flight, namespace, disk, folder: seen, base })
     }
 
     fn wait_for_keyframes(&mut self, count: usize) {

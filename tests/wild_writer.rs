@@ -182,7 +182,7 @@ impl Nonsense {
     fn send(&mut self, random: &mut Random) {
         let wild = f64::from_bits(WILD[random.below(4)]);
         let code = 100 + (random.bits() >> 40) as u32;
-        let sent = [
+        let _sent = [
             self.command.send(1, 1, &CommandRequest { command: code, ..CommandRequest::default() }),
             self.mission.send(1, 1, &MissionRequest { command: code, ..MissionRequest::default() }),
             self.capture.send(1, 1, &CaptureRequest { reason: code, keyframe_id: 3, ..CaptureRequest::default() }),
