@@ -4,8 +4,8 @@
 //! stretched over the run. Everything else follows 3DGS: 0.8 L1 + 0.2 (1 - SSIM) over the whole image, the published rates.
 
 use splatting::order::Random;
-use splatting::rgbd::prune::{self, DepthView, PruneRules};
-use splatting::{DefaultSettings, Gaussians, McmcSettings, RenderSettings, Schedule, Strategy, TrainingSettings};
+use splatting::rgbd::prune::PruneRules;
+use splatting::{DefaultSettings, McmcSettings, RenderSettings, Schedule, Strategy, TrainingSettings};
 
 use crate::dataset::{Dataset, Stage};
 use crate::options::{Background, Options, StrategyName};
@@ -81,13 +81,10 @@ impl Recipe {
         self.rules.is_some() && (iteration.is_multiple_of(PRUNE_EVERY) || iteration == iterations)
     }
 
-    /// Which Gaussians a mission's rules keep.
+    /// What a mission removes; `None` for other datasets.
     #[must_use]
-    pub fn keep(&self, model: &Gaussians, views: &[DepthView<'_>]) -> Vec<bool> {
-        match &self.rules {
-            Some(rules) => prune::keep(model, views, rules),
-            None => vec![true; model.len()],
-        }
+    pub fn rules(&self) -> Option<&PruneRules> {
+        self.rules.as_ref()
     }
 }
 

@@ -267,19 +267,12 @@ impl<'a> Run<'a> {
 
     /// Takes away what a mission's rules say.
     fn prune(&mut self) -> Result<(), ReconstructError> {
-        let views: Vec<DepthView<'_>> = self
-            .views
-            .images()
-            .iter()
-            .filter_map(|image| Some(DepthView { camera: &image.camera, depth_m: image.depth_m.as_deref()? }))
+        let Some(rules) = self.recipe.rules() else { return Ok(()) };
+        let images = self.views.images().iter().zip(0..);
+        let views: Vec<DepthView<'_>> = images
+            .filter_map(|(image, id)| Some(DepthView { id, camera: &image.camera, depth_m: image.depth_m.as_deref()? }))
             .collect();
-        let (model, optimiser, statistics) = self.training.lists_mut()?;
-        let kept = self.recipe.keep(model, &views);
-        let keep = |index: usize| kept.get(index).copied().unwrap_or(false);
-        model.retain(keep);
-        optimiser.retain(keep);
-        statistics.retain(keep);
-        Ok(())
+        Ok(self.training.prune(&views, rules)?)
     }
 
     /// Brings the newest model here, wherever it is trained.

@@ -14,6 +14,7 @@ pub mod bytes;
 mod camera;
 pub mod checkpoint;
 mod densify;
+mod edit;
 mod engine;
 pub mod formats;
 mod frame;
@@ -49,6 +50,7 @@ pub use camera::{Camera, Pose, RenderSettings};
 pub use densify::{
     DefaultSettings, Densifier, DensifierState, DensifyError, DensifyReport, McmcSettings, Relocation, Strategy,
 };
+pub use edit::Draft;
 pub use engine::{DEPTH_ALPHA_TINY, Engine, EngineError, Moments, MomentsView, Rendered, Work};
 pub use formats::ply;
 pub use initial::{ColoredPoint, InitialError, InitialGaussians, random_points};

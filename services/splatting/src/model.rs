@@ -8,6 +8,8 @@
 use bytemuck::{Pod, Zeroable};
 use glam::{Quat, Vec3};
 
+use crate::edit::is_fresh;
+
 /// Gaussians per block, the width of every SIMD path.
 pub const LANES: usize = 16;
 /// Parameters per Gaussian: mean 3, log scales 3, rotation 4, opacity logit 1, SH degree 0 3.
@@ -104,7 +106,7 @@ impl Gaussian {
             && self.sh.iter().all(|s| s.is_finite())
     }
 
-    fn row(&self) -> [f32; ROWS] {
+    pub(crate) fn row(&self) -> [f32; ROWS] {
         let (m, s, q) = (self.mean, self.log_scales, self.rotation);
         let [r, g, b] = self.sh;
         [m.x, m.y, m.z, s.x, s.y, s.z, q.x, q.y, q.z, q.w, self.opacity_logit, r, g, b]
@@ -329,7 +331,18 @@ impl Gaussians {
         &self.rest
     }
 
+    /// Lowers opacity logits to `ceiling`.
+    pub(crate) fn lower_opacities(&mut self, ceiling: f32) {
+        for index in 0..self.len() {
+            let logit = &mut self.blocks[index / LANES].0[ROW_OPACITY].0[index % LANES];
+            if *logit > ceiling {
+                *logit = ceiling;
+            }
+        }
+    }
+
     fn select(&mut self, from: &[u32]) {
+        debug_assert!(from.iter().all(|&i| (i as usize) < self.len()));
         self.blocks = select_lanes(&self.blocks, from);
         self.rest = select_row_lanes(&self.rest, sh_rest_rows(self.sh_degree), from);
         self.ids = from.iter().map(|&i| self.ids[i as usize]).collect();
@@ -353,23 +366,23 @@ impl FromIterator<Gaussian> for Gaussians {
     }
 }
 
-/// New blocks whose lane `i` is the old lane `from[i]`.
+/// New blocks whose lane `i` is the old lane `from[i]`, or zero where that is a fresh source.
 pub(crate) fn select_lanes(blocks: &[Block], from: &[u32]) -> Vec<Block> {
     let mut selected = vec![Block::ZERO; from.len().div_ceil(LANES)];
-    for (to, &i) in from.iter().enumerate() {
+    for (to, &i) in from.iter().enumerate().filter(|(_, source)| !is_fresh(**source)) {
         let i = i as usize;
         selected[to / LANES].copy_lane(to % LANES, &blocks[i / LANES], i % LANES);
     }
     selected
 }
 
-/// New rows, `rows` for each block, whose lane `i` is the old lane `from[i]`.
+/// New rows, `rows` for each block, whose lane `i` is the old lane `from[i]`, or zero where that is a fresh source.
 pub(crate) fn select_row_lanes(old: &[Lanes], rows: usize, from: &[u32]) -> Vec<Lanes> {
     let mut selected = vec![Lanes([0.0; LANES]); from.len().div_ceil(LANES) * rows];
     if rows == 0 {
         return selected;
     }
-    for (to, &i) in from.iter().enumerate() {
+    for (to, &i) in from.iter().enumerate().filter(|(_, source)| !is_fresh(**source)) {
         let i = i as usize;
         let (to_block, from_block) = (to / LANES * rows, i / LANES * rows);
         for row in 0..rows {

@@ -1,5 +1,6 @@
 //! Adam with a state that lives as long as the mission (A32), one step count per Gaussian, drawn Gaussians only.
 
+use crate::edit::is_fresh;
 use crate::model::{
     Block, Gaussians, LANES, Lanes, ROW_LOG_SCALE, ROW_OPACITY, ROW_ROTATION, ROW_SH, ROWS, SH_C0, SH_REST_MAX,
     resize_rows, select_lanes, select_row_lanes, sh_rest_rows,
@@ -83,18 +84,9 @@ impl Optimiser {
         self.select(order);
     }
 
-    /// Forgets moments and step count of one Gaussian, as for one that has just been added.
-    ///
-    /// # Panics
-    /// Where `index >= len()`, as a slice does.
-    pub fn reset(&mut self, index: usize) {
-        self.steps[index] = 0;
-        let (block, lane) = (index / LANES, index % LANES);
-        let rows = sh_rest_rows(self.sh_degree);
-        let rest = block * rows..(block + 1) * rows;
-        let first = self.first[block].0.iter_mut().chain(&mut self.first_rest[rest.clone()]);
-        let second = self.second[block].0.iter_mut().chain(&mut self.second_rest[rest]);
-        first.chain(second).for_each(|row| row.0[lane] = 0.0);
+    /// Takes the order of an edited list: the new state `i` is that of its source, or none yet where it is fresh.
+    pub(crate) fn follow(&mut self, sources: &[u32]) {
+        self.select(sources);
     }
 
     /// Forgets the moments of all opacities, not the step counts, as 3DGS does when it resets opacities.
@@ -110,7 +102,7 @@ impl Optimiser {
         let rows = sh_rest_rows(self.sh_degree);
         self.first_rest = select_row_lanes(&self.first_rest, rows, from);
         self.second_rest = select_row_lanes(&self.second_rest, rows, from);
-        self.steps = from.iter().map(|&i| self.steps[i as usize]).collect();
+        self.steps = from.iter().map(|&i| if is_fresh(i) { 0 } else { self.steps[i as usize] }).collect();
     }
 }
 

@@ -133,6 +133,11 @@ impl ScreenStatistics {
         self.select(order);
     }
 
+    /// Takes the order of an edited list: the new Gaussian `i` was seen as its source was, or not yet where it is fresh.
+    pub(crate) fn follow(&mut self, sources: &[u32]) {
+        self.select(sources);
+    }
+
     /// Bytes for a checkpoint: gradient sum, views and radius of each Gaussian in turn, f32 little-endian.
     pub fn encode(&self) -> Vec<u8> {
         (0..self.length)

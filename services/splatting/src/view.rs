@@ -148,8 +148,8 @@ impl TrainingView {
         Self::new(camera, color, depth_m, &vec![PixelClass::Foreground; color.len()])
     }
 
-    /// Tells views apart, in this process: the GPU keeps what it has of each.
-    pub(crate) fn id(&self) -> u64 {
+    /// Tells views apart, in this process: a GPU keeps what it has of each by it.
+    pub fn id(&self) -> u64 {
         self.id
     }
 

@@ -137,7 +137,7 @@ impl Session {
         self.training.backend()
     }
 
-    /// The model, as of the last [`Session::sync`].
+    /// The model, as of the last [`Session::sync`]; how many Gaussians it has, and their ids, are always those of now.
     #[must_use]
     pub fn model(&self) -> &Gaussians {
         self.training.model()
@@ -279,15 +279,12 @@ impl Session {
     /// When the back end failed.
     pub fn finish(&mut self) -> Result<Option<FinishedRound>, BackendError> {
         let Some(spec) = self.active().cloned() else { return Ok(None) };
+        self.prune(&spec)?;
         self.sync()?;
         let progress = self.progress();
-        self.prune(&spec)?;
         self.progression.active = None;
-        let finished = FinishedRound {
-            generation: generation(progress.total_iterations, spec.round, true),
-            progress: Progress { gaussians: self.model().len() as u64, ..progress },
-            spec,
-        };
+        let generation = generation(progress.total_iterations, spec.round, true);
+        let finished = FinishedRound { generation, progress, spec };
         self.progression.finished.push(finished.clone());
         Ok(Some(finished))
     }
@@ -446,7 +443,6 @@ impl Session {
     }
 
     fn prune(&mut self, spec: &RoundSpec) -> Result<(), BackendError> {
-        self.sync()?;
         let edge = self.progression.grid.as_ref().map_or(0.0, VoxelGrid::edge_m);
         let rules = PruneRules {
             clip: self.clip(spec),
@@ -460,34 +456,22 @@ impl Session {
             .keyframes
             .iter()
             .filter_map(|id| self.views.get(id))
-            .map(|view| DepthView { camera: &view.camera, depth_m: &view.depth_m })
+            .map(|view| DepthView { id: view.training.id(), camera: &view.camera, depth_m: &view.depth_m })
             .collect();
-        let kept = prune::keep(self.training.model(), &views, &rules);
-        self.retain(&kept)
-    }
-
-    fn retain(&mut self, kept: &[bool]) -> Result<(), BackendError> {
-        let (model, optimiser) = self.training.parts_mut()?;
-        optimiser.fit(model);
-        model.retain(|i| kept.get(i).copied().unwrap_or(false));
-        optimiser.retain(|i| kept.get(i).copied().unwrap_or(false));
-        Ok(())
+        self.training.prune(&views, &rules)
     }
 
     /// Adds newborn Gaussians, making room at the cap, and brings neighbours together in memory.
     fn append(&mut self, mut born: Vec<Gaussian>) -> Result<(), BackendError> {
         let cap = self.model_config.max_gaussians as usize;
         born.truncate(cap);
-        let kept = prune::keep_most_contributing(self.training.model(), cap - born.len());
-        self.retain(&kept)?;
         self.progression.next_gaussian_id += born.len() as u64;
-        let (model, optimiser) = self.training.parts_mut()?;
-        model.extend(born);
-        optimiser.fit(model);
-        let order = model.morton_order();
-        model.permute(&order);
-        optimiser.permute(&order);
-        Ok(())
+        self.training.edit(|draft| {
+            let kept = prune::keep_most_contributing(draft.model(), cap - born.len());
+            draft.retain(|index| kept.get(index).copied().unwrap_or(false));
+            born.iter().for_each(|gaussian| draft.push(gaussian));
+            draft.sort_along_curve();
+        })
     }
 
     pub(crate) fn reset(&mut self) {

@@ -99,13 +99,13 @@ impl DefaultSettings {
         iteration: u32,
         extent_m: f32,
         random: &mut Random,
-        lists: &mut Lists<'_>,
+        lists: &mut Lists<'_, '_>,
         report: &mut DensifyReport,
     ) {
-        let before = lists.model.len();
+        let before = lists.model().len();
         let mut keep = vec![true; before];
         for index in self.growing(lists) {
-            let parent = lists.model.get(index);
+            let parent = lists.model().get(index);
             if largest_scale(&parent) <= self.clone_scale * extent_m {
                 lists.push(parent, index);
                 report.cloned += 1;
@@ -117,31 +117,28 @@ impl DefaultSettings {
                 report.split += 1;
             }
         }
-        lists.fit();
-        keep.resize(lists.model.len(), true);
+        keep.resize(lists.model().len(), true);
         let sizes_count = iteration > self.reset_every;
         for (index, keep) in keep.iter_mut().enumerate().filter(|(_, keep)| **keep) {
-            let gaussian = lists.model.get(index);
+            let gaussian = lists.model().get(index);
             let too_big = largest_scale(&gaussian) > self.prune_scale * extent_m
-                || self.prune_radius_px.is_some_and(|limit| lists.statistics.radius_px(index) > limit);
+                || self.prune_radius_px.is_some_and(|limit| lists.draft.radius_px(index) > limit);
             if gaussian.opacity() < self.prune_opacity || sizes_count && too_big || !gaussian.is_finite() {
                 *keep = false;
                 report.pruned += 1;
             }
         }
-        if keep.contains(&false) {
-            lists.retain(&keep);
-        }
+        lists.draft.retain(|index| keep[index]);
     }
 
     /// Indices of the Gaussians to clone or split, in order.
-    fn growing(&self, lists: &Lists<'_>) -> Vec<usize> {
-        let gradient = |&i: &usize| lists.statistics.mean_gradient(i);
-        let mut growing: Vec<usize> = (0..lists.model.len())
-            .filter(|i| gradient(i) >= self.grow_gradient && lists.model.get(*i).is_finite())
+    fn growing(&self, lists: &Lists<'_, '_>) -> Vec<usize> {
+        let gradient = |&i: &usize| lists.draft.statistics().mean_gradient(i);
+        let mut growing: Vec<usize> = (0..lists.model().len())
+            .filter(|i| gradient(i) >= self.grow_gradient && lists.model().get(*i).is_finite())
             .collect();
         // Each adds one, whether it is cloned or split.
-        let room = self.max_gaussians.saturating_sub(lists.model.len());
+        let room = self.max_gaussians.saturating_sub(lists.model().len());
         if growing.len() > room {
             growing.sort_by(|a, b| gradient(b).total_cmp(&gradient(a)).then(a.cmp(b)));
             growing.truncate(room);
@@ -156,16 +153,9 @@ impl DefaultSettings {
         Gaussian { mean: parent.mean + offset, log_scales: parent.log_scales - self.split_shrink.ln(), ..*parent }
     }
 
-    /// Lowers opacities to [`DefaultSettings::reset_opacity`] and forgets their moments.
-    pub(super) fn reset_opacities(&self, lists: &mut Lists<'_>) {
-        let ceiling = (self.reset_opacity / (1.0 - self.reset_opacity)).ln();
-        for index in 0..lists.model.len() {
-            let gaussian = lists.model.get(index);
-            if gaussian.opacity_logit > ceiling {
-                lists.model.set(index, &Gaussian { opacity_logit: ceiling, ..gaussian });
-            }
-        }
-        lists.optimiser.reset_opacities();
+    /// Logit of [`DefaultSettings::reset_opacity`].
+    pub(super) fn reset_logit(&self) -> f32 {
+        (self.reset_opacity / (1.0 - self.reset_opacity)).ln()
     }
 }
 

@@ -89,28 +89,25 @@ impl McmcSettings {
 
     /// Moves the dead to the living, then adds some more beside the living, each time with a chance in proportion to
     /// opacity.
-    pub(super) fn refine(&self, random: &mut Random, lists: &mut Lists<'_>, report: &mut DensifyReport) {
-        let dead: Vec<usize> = (0..lists.model.len()).filter(|&i| self.is_dead(&lists.model.get(i))).collect();
-        let origins = self.draw(dead.len(), random, lists.model);
+    pub(super) fn refine(&self, random: &mut Random, lists: &mut Lists<'_, '_>, report: &mut DensifyReport) {
+        let model = lists.model();
+        let dead: Vec<usize> = (0..model.len()).filter(|&i| self.is_dead(&model.get(i))).collect();
+        let origins = self.draw(dead.len(), random, model);
         self.share(&origins, lists);
         for (&index, &origin) in dead.iter().zip(&origins) {
             let id = lists.fresh_id();
-            let rest = lists.model.sh_rest(origin);
-            let gaussian = Gaussian { id, ..lists.model.get(origin) };
-            lists.model.set(index, &gaussian);
-            lists.model.set_sh_rest(index, &rest);
-            lists.optimiser.reset(index);
+            let gaussian = Gaussian { id, ..lists.model().get(origin) };
+            lists.draft.replace(index, &gaussian, origin);
         }
         report.relocated += origins.len();
 
-        let count = lists.model.len();
+        let count = lists.model().len();
         let target = ((count as f64 * f64::from(self.growth)) as usize).min(self.max_gaussians);
-        let origins = self.draw(target.saturating_sub(count), random, lists.model);
+        let origins = self.draw(target.saturating_sub(count), random, lists.model());
         self.share(&origins, lists);
         for &origin in &origins {
-            lists.push(lists.model.get(origin), origin);
+            lists.push(lists.model().get(origin), origin);
         }
-        lists.fit();
         report.added += origins.len();
     }
 
@@ -140,18 +137,17 @@ impl McmcSettings {
     }
 
     /// Gives each of the drawn Gaussians the opacity and the scales that it will share with its copies.
-    fn share(&self, origins: &[usize], lists: &mut Lists<'_>) {
-        let mut copies = vec![0_u32; lists.model.len()];
+    fn share(&self, origins: &[usize], lists: &mut Lists<'_, '_>) {
+        let mut copies = vec![0_u32; lists.model().len()];
         for &origin in origins {
             copies[origin] += 1;
         }
         for (index, &copies) in copies.iter().enumerate().filter(|(_, copies)| **copies > 0) {
-            let old = lists.model.get(index);
+            let old = lists.model().get(index);
             let new = Relocation::new(f64::from(old.opacity()), copies + 1, self.dead_opacity);
             let opacity_logit = (new.opacity / (1.0 - new.opacity)).ln() as f32;
             let log_scales = old.log_scales + new.scale_ratio.ln() as f32;
-            lists.model.set(index, &Gaussian { opacity_logit, log_scales, ..old });
-            lists.optimiser.reset(index);
+            lists.draft.replace(index, &Gaussian { opacity_logit, log_scales, ..old }, index);
         }
     }
 }

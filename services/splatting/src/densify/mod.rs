@@ -11,11 +11,10 @@ mod noise;
 use thiserror::Error;
 
 use crate::backend::{BackendError, Training};
+use crate::edit::{Draft, Looks};
 use crate::model::{Gaussian, Gaussians};
-use crate::optimiser::Optimiser;
 use crate::random::Random;
 use crate::settings::TrainingSettings;
-use crate::statistics::ScreenStatistics;
 
 pub use adaptive::DefaultSettings;
 pub use mcmc::{McmcSettings, Relocation};
@@ -60,6 +59,16 @@ impl Strategy {
             Self::None => false,
             Self::Default(settings) => settings.refines(iteration) || settings.resets(iteration),
             Self::Mcmc(settings) => settings.refines(iteration),
+        }
+    }
+
+    /// What a decision after the step of this iteration is made of.
+    fn looks_at(&self, iteration: u32) -> Looks {
+        match self {
+            Self::Default(settings) if settings.refines(iteration) => Looks::Seen,
+            Self::Mcmc(_) => Looks::Parameters,
+            // Bringing opacities down asks nothing.
+            Self::None | Self::Default(_) => Looks::Nothing,
         }
     }
 
@@ -236,8 +245,8 @@ impl Densifier {
     ) -> Result<DensifyReport, BackendError> {
         let mut report = DensifyReport::default();
         if self.strategy.acts(iteration) {
-            let (model, optimiser, statistics) = training.lists_mut()?;
-            report = self.act(iteration, (model, optimiser, statistics));
+            let looks = self.strategy.looks_at(iteration);
+            report = training.edit_looking(looks, |draft| self.act(iteration, draft))?;
         }
         if let Strategy::Mcmc(strategy) = &self.strategy
             && iteration < strategy.noise_stop
@@ -248,18 +257,18 @@ impl Densifier {
     }
 
     /// Changes the list of Gaussians, or their opacities.
-    fn act(&mut self, iteration: u32, (model, optimiser, statistics): Parts<'_>) -> DensifyReport {
-        let mut lists = Lists { model, optimiser, statistics, next_id: &mut self.next_id };
+    fn act(&mut self, iteration: u32, draft: &mut Draft<'_>) -> DensifyReport {
+        let mut lists = Lists { draft, next_id: &mut self.next_id };
         let mut report = DensifyReport::default();
         match &self.strategy {
             Strategy::None => {}
             Strategy::Default(strategy) => {
                 if strategy.refines(iteration) {
                     strategy.refine(iteration, self.extent_m, &mut self.random, &mut lists, &mut report);
-                    lists.statistics.reset();
+                    lists.draft.forget_statistics();
                 }
                 if strategy.resets(iteration) {
-                    strategy.reset_opacities(&mut lists);
+                    lists.draft.lower_opacities(strategy.reset_logit());
                     report.reset = true;
                 }
             }
@@ -270,25 +279,19 @@ impl Densifier {
             }
         }
         if report.changed_list() {
-            let order = lists.model.morton_order();
-            lists.permute(&order);
+            draft.sort_along_curve();
         }
         report
     }
 }
 
-/// Model, optimiser and statistics.
-type Parts<'a> = (&'a mut Gaussians, &'a mut Optimiser, &'a mut ScreenStatistics);
-
-/// What holds one entry per Gaussian, changed together.
-struct Lists<'a> {
-    model: &'a mut Gaussians,
-    optimiser: &'a mut Optimiser,
-    statistics: &'a mut ScreenStatistics,
+/// The list of Gaussians, and ids for those that are added.
+struct Lists<'a, 'b> {
+    draft: &'a mut Draft<'b>,
     next_id: &'a mut u64,
 }
 
-impl Lists<'_> {
+impl Lists<'_, '_> {
     /// An id that no Gaussian has had.
     fn fresh_id(&mut self) -> u64 {
         let id = *self.next_id;
@@ -299,26 +302,10 @@ impl Lists<'_> {
     /// Appends a Gaussian with a new id and with the higher bands of the Gaussian at `origin`.
     fn push(&mut self, gaussian: Gaussian, origin: usize) {
         let id = self.fresh_id();
-        let rest = self.model.sh_rest(origin);
-        self.model.push(&Gaussian { id, ..gaussian });
-        self.model.set_sh_rest(self.model.len() - 1, &rest);
+        self.draft.push_beside(&Gaussian { id, ..gaussian }, origin);
     }
 
-    /// Gives appended Gaussians their zero state.
-    fn fit(&mut self) {
-        self.optimiser.fit(self.model);
-        self.statistics.fit(self.model);
-    }
-
-    fn retain(&mut self, keep: &[bool]) {
-        self.model.retain(|i| keep[i]);
-        self.optimiser.retain(|i| keep[i]);
-        self.statistics.retain(|i| keep[i]);
-    }
-
-    fn permute(&mut self, order: &[u32]) {
-        self.model.permute(order);
-        self.optimiser.permute(order);
-        self.statistics.permute(order);
+    fn model(&self) -> &Gaussians {
+        self.draft.model()
     }
 }

@@ -1,7 +1,6 @@
 //! The chain of kernels from Gaussians to the lists of splats per tile, for one view or for many at once.
 
 use bytemuck::bytes_of;
-use wgpu::util::DeviceExt;
 use wgpu::{BindGroup, Buffer, BufferUsages, ComputePass};
 
 use super::buffers::Bytes;
@@ -99,6 +98,8 @@ pub(super) struct Chain {
     pub control: Buffer,
     pub bytes: Bytes,
     project: BindGroup,
+    /// Workgroups of what comes after the first pass of the sort, where they are dispatched indirectly.
+    arguments: Option<Buffer>,
     sort: [(BindGroup, BindGroup, BindGroup); 4],
     bin: [BindGroup; 3],
 }
@@ -133,6 +134,10 @@ impl Chain {
         let starts = storage("tile lists", 4 * (tiles + 1) * count)?;
         let entries = storage("tile lists", 4 * u64::from(size.capacity) * count)?;
         let control = storage("control", 4 * (CONTROL_WORDS + 3 * u64::from(job.parameter_groups)))?;
+        // A kernel that is dispatched by a buffer must not be able to write to it: the later passes see another one.
+        let idle = storage("control", 32)?;
+        let usage = BufferUsages::STORAGE | BufferUsages::INDIRECT;
+        let arguments = (size.views == 1 && context.indirect).then(|| context.buffer("arguments", 64, usage));
         context.check()?;
 
         let project = kernels.project.bind(
@@ -143,13 +148,10 @@ impl Chain {
         let passes = [0, 1, 2, 3].map(|pass: usize| {
             let (from, to) = (pass % 2, (pass + 1) % 2);
             let count = kernels.sort_count.bind(context, 0, &[jobs, &keys[from], &control, &counts]);
-            let buffers = [jobs, &keys[from], &order[from], &counts, &control, &keys[to], &order[to]];
+            let arguments = arguments.as_ref().filter(|_| pass == 0).unwrap_or(&idle);
+            let buffers = [jobs, &keys[from], &order[from], &counts, &control, &keys[to], &order[to], arguments];
             let moved = kernels.sort_move.bind(context, 0, &buffers);
-            let constant = context.device.create_buffer_init(&wgpu::util::BufferInitDescriptor {
-                label: Some("pass of the sort"),
-                contents: bytes_of(&[PASSES[pass], u32::from(pass == 0), 0, 0]),
-                usage: BufferUsages::UNIFORM,
-            });
+            let constant = context.constant(bytes_of(&[PASSES[pass], u32::from(pass == 0), 0, 0]));
             (count, moved, kernels.sort_count.bind_second(context, &[&constant]))
         });
         let bin = [
@@ -158,7 +160,20 @@ impl Chain {
             kernels.bin_fill.bind(context, 0, &[jobs, &control, &order[0], &boxes, &table, &entries]),
         ];
         context.check()?;
-        Ok(Self { size, views: size.views, rows, boxes, entries, starts, control, bytes, project, sort: passes, bin })
+        Ok(Self {
+            size,
+            views: size.views,
+            rows,
+            boxes,
+            entries,
+            starts,
+            control,
+            bytes,
+            project,
+            arguments,
+            sort: passes,
+            bin,
+        })
     }
 
     /// Records one of the stages that lead to the lists. `offsets` are those of the job and of the views.
@@ -170,17 +185,20 @@ impl Chain {
                 dispatch(pass, &kernels.project, &self.project, offsets, (x, y, views));
             }
             Listing::Sort => {
-                for (count, moved, constant) in &self.sort {
+                let groups = (job.sort_groups, 1, views);
+                for (at, (count, moved, constant)) in self.sort.iter().enumerate() {
                     pass.set_bind_group(1, constant, &[]);
-                    dispatch(pass, &kernels.sort_count, count, offsets, (job.sort_groups, 1, views));
-                    dispatch(pass, &kernels.sort_move, moved, offsets, (job.sort_groups, 1, views));
+                    let arguments = self.arguments.as_ref().filter(|_| at > 0).map(|buffer| (buffer, 0));
+                    dispatch_by(pass, &kernels.sort_count, count, offsets, (groups, arguments));
+                    dispatch_by(pass, &kernels.sort_move, moved, offsets, (groups, arguments));
                 }
             }
             Listing::Bin => {
                 let parts = (job.bin_groups, self.size.tiles().div_ceil(256), views);
-                dispatch(pass, &kernels.bin_count, &self.bin[0], offsets, parts);
+                let arguments = self.arguments.as_ref().map(|buffer| (buffer, 16));
+                dispatch_by(pass, &kernels.bin_count, &self.bin[0], offsets, (parts, arguments));
                 dispatch(pass, &kernels.bin_offsets, &self.bin[1], offsets, (1, 1, views));
-                dispatch(pass, &kernels.bin_fill, &self.bin[2], offsets, parts);
+                dispatch_by(pass, &kernels.bin_fill, &self.bin[2], offsets, (parts, arguments));
             }
         }
     }
@@ -193,17 +211,42 @@ impl Chain {
     }
 }
 
+/// Workgroups along each dimension.
+type Grid = (u32, u32, u32);
+
 /// Records one dispatch of a kernel with a single group of bindings.
 pub(super) fn dispatch(
     pass: &mut ComputePass<'_>,
     kernel: &Kernel,
     group: &BindGroup,
     offsets: &[u32; 2],
-    (x, y, z): (u32, u32, u32),
+    groups: Grid,
 ) {
+    dispatch_by(pass, kernel, group, offsets, (groups, None));
+}
+
+/// The same, by as many workgroups as a buffer says at an offset, or as are named where there is none.
+fn dispatch_by(
+    pass: &mut ComputePass<'_>,
+    kernel: &Kernel,
+    group: &BindGroup,
+    offsets: &[u32; 2],
+    ((x, y, z), arguments): (Grid, Option<(&Buffer, u64)>),
+) {
+    #[cfg(test)]
+    DISPATCHES.set(DISPATCHES.get() + 1);
     pass.set_pipeline(&kernel.pipeline);
     pass.set_bind_group(0, group, kernel.offsets(offsets));
-    pass.dispatch_workgroups(x, y, z);
+    match arguments {
+        Some((buffer, offset)) => pass.dispatch_workgroups_indirect(buffer, offset),
+        None => pass.dispatch_workgroups(x, y, z),
+    }
+}
+
+#[cfg(test)]
+thread_local! {
+    /// Dispatches that were recorded by a test.
+    pub(super) static DISPATCHES: std::cell::Cell<u32> = const { std::cell::Cell::new(0) };
 }
 
 /// A buffer of views for one batch.

@@ -1,12 +1,14 @@
 //! A device with its queue, and what it reports: faults instead of panics, bytes by name.
 
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::mpsc;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
+use wgpu::util::DeviceExt;
 use wgpu::{
-    Adapter, Buffer, BufferDescriptor, BufferUsages, CommandEncoder, Device, DeviceType, Features, Limits, MapMode,
-    PollType, Queue,
+    Adapter, Buffer, BufferDescriptor, BufferUsages, CommandEncoder, Device, DeviceType, DownlevelFlags, Features,
+    Limits, MapMode, PollType, Queue,
 };
 
 use super::error::GpuError;
@@ -27,7 +29,11 @@ pub(super) struct Context {
     pub name: String,
     pub features: Features,
     pub max_binding: u64,
+    /// Whether a buffer can say how many workgroups there are.
+    pub indirect: bool,
     patience: Duration,
+    up: AtomicU64,
+    down: AtomicU64,
     fault: Arc<Mutex<Option<GpuError>>>,
 }
 
@@ -78,8 +84,20 @@ impl Context {
             let found = GpuError::Lost(format!("{message} ({reason:?})"));
             *lost.lock().unwrap_or_else(PoisonError::into_inner) = Some(found);
         });
+        let indirect = adapter.get_downlevel_capabilities().flags.contains(DownlevelFlags::INDIRECT_EXECUTION);
         let patience = if info.device_type == DeviceType::Cpu { PATIENCE_SOFTWARE } else { PATIENCE };
-        Ok(Self { device, queue, name: info.name, features, max_binding, patience, fault })
+        Ok(Self {
+            device,
+            queue,
+            name: info.name,
+            features,
+            max_binding,
+            indirect,
+            patience,
+            up: AtomicU64::new(0),
+            down: AtomicU64::new(0),
+            fault,
+        })
     }
 
     /// What went wrong so far, if anything.
@@ -113,6 +131,35 @@ impl Context {
         })
     }
 
+    /// A uniform buffer that is never changed.
+    pub fn constant(&self, contents: &[u8]) -> Buffer {
+        self.device.create_buffer_init(&wgpu::util::BufferInitDescriptor {
+            label: Some("constant"),
+            contents,
+            usage: BufferUsages::UNIFORM,
+        })
+    }
+
+    /// A buffer for kernels with these contents.
+    pub fn filled(&self, what: &'static str, contents: &[u8]) -> Result<Buffer, GpuError> {
+        let buffer = self.storage(what, contents.len() as u64)?;
+        self.write(&buffer, 0, contents);
+        Ok(buffer)
+    }
+
+    /// Puts bytes into a buffer, from `offset` on.
+    pub fn write(&self, buffer: &Buffer, offset: u64, contents: &[u8]) {
+        if !contents.is_empty() {
+            self.up.fetch_add(contents.len() as u64, Ordering::Relaxed);
+            self.queue.write_buffer(buffer, offset, contents);
+        }
+    }
+
+    /// Bytes of models, lists and images that went up so far, and that came down.
+    pub fn traffic(&self) -> (u64, u64) {
+        (self.up.load(Ordering::Relaxed), self.down.load(Ordering::Relaxed))
+    }
+
     /// A buffer that the host can map.
     pub fn staging(&self, bytes: u64) -> Buffer {
         let usage = BufferUsages::MAP_READ | BufferUsages::COPY_DST;
@@ -123,6 +170,7 @@ impl Context {
     pub fn read<const N: usize>(&self, from: [(&Buffer, u64); N]) -> Result<[Vec<u8>; N], GpuError> {
         self.check()?;
         let mut encoder = self.encoder();
+        self.down.fetch_add(from.iter().map(|(_, bytes)| bytes).sum(), Ordering::Relaxed);
         let staging = from.map(|(buffer, bytes)| {
             let staging = self.staging(bytes);
             encoder.copy_buffer_to_buffer(buffer, 0, &staging, 0, bytes);

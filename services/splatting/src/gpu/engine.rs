@@ -12,11 +12,13 @@ use super::drawing::{Drawing, overflow};
 use super::error::GpuError;
 use super::job::View;
 use super::kernels::Kernels;
+use super::keyframe::Keyframes;
 use super::model::DeviceModel;
 use super::peak;
-use super::training::{Gradients, Keyframes, STAGES, Trainer};
+use super::probing::Gradients;
+use super::pruning::Depths;
+use super::training::{STAGES, Trainer};
 use crate::camera::{Camera, RenderSettings};
-use crate::densify::Noise;
 use crate::engine::{DEPTH_ALPHA_TINY, Rendered};
 use crate::model::{Block, Gaussians, LANES, Lanes, ROWS, SH_REST_MAX, sh_rest_coefficients, sh_rest_rows};
 use crate::optimiser::Optimiser;
@@ -34,6 +36,8 @@ pub struct Options {
     pub without_subgroups: bool,
     /// Do without atomic addition of floats.
     pub without_float_atomics: bool,
+    /// Do without dispatches whose size the GPU decides.
+    pub without_indirect: bool,
     /// Give sums of gradients an order, so that runs on the same adapter and driver repeat bit for bit, for 192 bytes
     /// per (tile, splat) pair.
     pub deterministic: bool,
@@ -48,6 +52,10 @@ pub struct Engine {
     pub(super) model: Option<DeviceModel>,
     pub(super) trainer: Option<Trainer>,
     pub(super) keyframes: Keyframes,
+    /// Depth images that pruning looks at.
+    pub(super) depths: Depths,
+    /// Terms of iterations whose trainer is gone.
+    pub(super) told: Vec<LossTerms>,
     pub(super) copying: Option<Copying>,
     /// Where the last copy came through.
     pub(super) copy_staging: Option<Buffer>,
@@ -67,7 +75,8 @@ impl Engine {
         let mut excluded = Features::empty();
         excluded.set(Features::SUBGROUP, options.without_subgroups);
         excluded.set(Features::SHADER_FLOAT32_ATOMIC, options.without_float_atomics);
-        let context = Context::new(&adapter, excluded)?;
+        let mut context = Context::new(&adapter, excluded)?;
+        context.indirect &= !options.without_indirect;
         let kernels = Kernels::new(&context, options.deterministic)?;
         Ok(Self {
             context,
@@ -75,6 +84,8 @@ impl Engine {
             model: None,
             trainer: None,
             keyframes: Keyframes::default(),
+            depths: Depths::default(),
+            told: Vec::new(),
             copying: None,
             copy_staging: None,
             taken_back: 0,
@@ -95,7 +106,7 @@ impl Engine {
     /// Bytes allocated on the GPU, by what for.
     pub fn bytes(&self) -> Vec<(&'static str, u64)> {
         let mut all: Vec<(&'static str, u64)> = Vec::new();
-        let model = self.model.iter().map(|model| model.bytes.clone());
+        let model = self.model.iter().map(DeviceModel::bytes);
         let trainer = self.trainer.iter().flat_map(Trainer::all_bytes);
         for (what, bytes) in model.chain(trainer).flat_map(Bytes::into_list) {
             match all.iter_mut().find(|(name, _)| *name == what) {
@@ -104,9 +115,16 @@ impl Engine {
             }
         }
         all.push(("keyframes", self.keyframes.bytes()));
+        all.push(("depth images", self.depths.bytes()));
         let staging = self.copying.iter().map(Copying::bytes).chain(self.copy_staging.iter().map(Buffer::size));
         all.push(("snapshots", staging.sum()));
         all
+    }
+
+    /// Bytes of models, lists and images that went up to the GPU so far, and that came down. Not the jobs and the losses of
+    /// iterations, and not snapshots.
+    pub fn traffic(&self) -> (u64, u64) {
+        self.context.traffic()
     }
 
     fn likely_pairs(&self, gaussians: u32) -> u32 {
@@ -188,6 +206,7 @@ impl Engine {
         optimiser.fit(gaussians);
         statistics.fit(gaussians);
         self.forget_copy();
+        self.told.clear();
         self.trainer = None;
         self.model = None;
         self.model = Some(DeviceModel::upload(&self.context, gaussians, Some((optimiser, statistics)))?);
@@ -238,19 +257,15 @@ impl Engine {
         self.collect(false)
     }
 
-    /// Moves the means by noise after the step that was asked for last. `false` where none is waiting: after
-    /// [`Engine::finish`].
-    pub(crate) fn add_noise(&mut self, noise: &Noise) -> bool {
-        self.trainer.as_mut().is_some_and(|trainer| trainer.add_noise(noise))
-    }
-
     /// Losses that have arrived since the last call, in the order of the steps.
     ///
     /// # Errors
     /// Where the GPU fails.
     pub fn finished(&mut self) -> Result<Vec<LossTerms>, GpuError> {
         self.collect(false)?;
-        Ok(self.trainer.as_mut().map(Trainer::take_finished).unwrap_or_default())
+        let mut finished = std::mem::take(&mut self.told);
+        finished.extend(self.trainer.iter_mut().flat_map(Trainer::take_finished));
+        Ok(finished)
     }
 
     /// Waits until all iterations that were asked for are done.

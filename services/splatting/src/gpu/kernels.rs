@@ -46,10 +46,11 @@ const TILE_LISTS: &str = shader!("tile_lists");
 const MOMENTS: &str = shader!("moments");
 const KEYFRAME: &str = shader!("keyframe");
 const BACKWARD: &str = shader!("backward");
+const GROUPS: &str = shader!("groups");
 const SORT_MOVE: &str = shader!("sort_move");
 
 const BACKWARD_BINDINGS: &[Kind] = &[Job, Views, Read, Read, Read, Read, Read, Write];
-const SORT_BINDINGS: &[Kind] = &[Job, Read, Read, Read, Write, Write, Write];
+const SORT_BINDINGS: &[Kind] = &[Job, Read, Read, Read, Write, Write, Write, Write];
 
 /// Every kernel, with both variants of those that have two.
 pub(super) const SOURCES: &[Source] = &[
@@ -61,37 +62,37 @@ pub(super) const SOURCES: &[Source] = &[
     },
     Source {
         name: "sort_count",
-        parts: &[JOB, shader!("sort_count")],
+        parts: &[JOB, GROUPS, shader!("sort_count")],
         group0: &[Job, Read, Read, Write],
         group1: &[Constant],
     },
     Source {
         name: "sort_move_plain",
-        parts: &[JOB, SORT_MOVE, shader!("sort_move_plain")],
+        parts: &[JOB, GROUPS, SORT_MOVE, shader!("sort_move_plain")],
         group0: SORT_BINDINGS,
         group1: &[Constant],
     },
     Source {
         name: "sort_move_subgroup",
-        parts: &[JOB, SORT_MOVE, shader!("sort_move_subgroup")],
+        parts: &[JOB, GROUPS, SORT_MOVE, shader!("sort_move_subgroup")],
         group0: SORT_BINDINGS,
         group1: &[Constant],
     },
     Source {
         name: "bin_count",
-        parts: &[JOB, shader!("bin_count")],
+        parts: &[JOB, GROUPS, shader!("bin_count")],
         group0: &[Job, Read, Read, Read, Write],
         group1: &[],
     },
     Source {
         name: "bin_offsets",
-        parts: &[JOB, shader!("bin_offsets")],
+        parts: &[JOB, GROUPS, shader!("bin_offsets")],
         group0: &[Job, Write, Write, Write],
         group1: &[],
     },
     Source {
         name: "bin_fill",
-        parts: &[JOB, shader!("bin_fill")],
+        parts: &[JOB, GROUPS, shader!("bin_fill")],
         group0: &[Job, Read, Read, Read, Read, Write],
         group1: &[],
     },
@@ -171,6 +172,26 @@ pub(super) const SOURCES: &[Source] = &[
         name: "gradient",
         parts: &[JOB, PROJECTION, HARMONICS, PARAMETERS, shader!("gradient")],
         group0: &[Job, Views, Read, Read, Write, Write, Write, Write],
+        group1: &[],
+    },
+    Source { name: "select", parts: &[JOB, shader!("select")], group0: &[Constant, Read, Read, Write], group1: &[] },
+    Source { name: "insert", parts: &[JOB, shader!("insert")], group0: &[Constant, Read, Write, Write], group1: &[] },
+    Source {
+        name: "lower_opacities",
+        parts: &[JOB, shader!("lower_opacities")],
+        group0: &[Constant, Write, Write],
+        group1: &[],
+    },
+    Source {
+        name: "prune_view",
+        parts: &[JOB, PROJECTION, shader!("prune_view")],
+        group0: &[Constant, Read, Read, Write],
+        group1: &[],
+    },
+    Source {
+        name: "prune",
+        parts: &[JOB, PROJECTION, shader!("prune")],
+        group0: &[Constant, Read, Read, Write],
         group1: &[],
     },
     Source { name: "metrics", parts: &[JOB, shader!("metrics")], group0: &[Job, Read, Read, Write], group1: &[] },
@@ -303,6 +324,11 @@ pub(super) struct Kernels {
     pub adam: Kernel,
     pub gradient: Kernel,
     pub metrics: Kernel,
+    pub select: Kernel,
+    pub insert: Kernel,
+    pub lower_opacities: Kernel,
+    pub prune_view: Kernel,
+    pub prune: Kernel,
 }
 
 impl Kernels {
@@ -332,6 +358,11 @@ impl Kernels {
             adam: kernel("adam")?,
             gradient: kernel("gradient")?,
             metrics: kernel("metrics")?,
+            select: kernel("select")?,
+            insert: kernel("insert")?,
+            lower_opacities: kernel("lower_opacities")?,
+            prune_view: kernel("prune_view")?,
+            prune: kernel("prune")?,
         })
     }
 }

@@ -1,5 +1,7 @@
 //! Keyframes on the GPU, with what the loss needs of them and no iteration changes.
 
+use std::collections::BTreeMap;
+
 use bytemuck::cast_slice;
 use wgpu::{BindGroup, Buffer};
 
@@ -17,6 +19,8 @@ const IGNORED: f32 = -1.0;
 const FREE: f32 = -2.0;
 const HAS_FOREGROUND: u32 = 1;
 const NEAR_FOREGROUND: u32 = 2;
+/// Most bytes that keyframes take; the one not used for longest goes first.
+const KEYFRAMES_MAX: u64 = 512 << 20;
 
 pub(super) struct DeviceKeyframe {
     /// Bindings of the kernels of the loss, which see the same.
@@ -67,8 +71,7 @@ impl DeviceKeyframe {
 
         let mut bytes = Bytes::default();
         let mut put = |what: &'static str, contents: &[u8]| -> Result<Buffer, GpuError> {
-            let buffer = context.storage(what, contents.len() as u64)?;
-            context.queue.write_buffer(&buffer, 0, contents);
+            let buffer = context.filled(what, contents)?;
             bytes.add(what, &buffer);
             Ok(buffer)
         };
@@ -85,5 +88,40 @@ impl DeviceKeyframe {
             bytes: bytes.into_list().iter().map(|(_, bytes)| bytes).sum(),
             used: 0,
         })
+    }
+}
+
+/// Keyframes by [`TrainingView::id`].
+#[derive(Default)]
+pub(super) struct Keyframes {
+    pub held: BTreeMap<u64, DeviceKeyframe>,
+    /// How often one was asked for, to know which was used last.
+    clock: u64,
+}
+
+impl Keyframes {
+    pub fn bytes(&self) -> u64 {
+        self.held.values().map(|keyframe| keyframe.bytes).sum()
+    }
+
+    /// Makes sure that a keyframe is there, and room for it.
+    pub fn hold(&mut self, context: &Context, kernels: &Kernels, view: &TrainingView) -> Result<(), GpuError> {
+        self.clock += 1;
+        if !self.held.contains_key(&view.id()) {
+            let keyframe = DeviceKeyframe::upload(context, kernels, view)?;
+            while self.bytes() + keyframe.bytes > KEYFRAMES_MAX {
+                let oldest = self.held.iter().min_by_key(|(_, keyframe)| keyframe.used).map(|(&id, _)| id);
+                match oldest {
+                    // What was recorded keeps its buffers alive.
+                    Some(id) => self.held.remove(&id),
+                    None => break,
+                };
+            }
+            self.held.insert(view.id(), keyframe);
+        }
+        if let Some(keyframe) = self.held.get_mut(&view.id()) {
+            keyframe.used = self.clock;
+        }
+        Ok(())
     }
 }

@@ -6,13 +6,14 @@ use wgpu::Buffer;
 use super::buffers::Bytes;
 use super::context::Context;
 use super::error::GpuError;
-use crate::model::{Block, Gaussians, Lanes, sh_rest_rows};
+use crate::edit::Looks;
+use crate::model::{Block, Gaussians, LANES, Lanes, sh_rest_rows};
 use crate::optimiser::Optimiser;
 use crate::statistics::{self, ScreenStatistics};
 
 const LANES_BYTES: u64 = size_of::<Lanes>() as u64;
-const BLOCK_BYTES: u64 = size_of::<Block>() as u64;
-const STATISTICS_BYTES: u64 = statistics::ROWS as u64 * LANES_BYTES;
+pub(super) const BLOCK_BYTES: u64 = size_of::<Block>() as u64;
+pub(super) const STATISTICS_BYTES: u64 = statistics::ROWS as u64 * LANES_BYTES;
 
 /// Buffers of a model.
 pub(super) struct DeviceModel {
@@ -22,7 +23,6 @@ pub(super) struct DeviceModel {
     pub sh_degree: u8,
     /// What only training needs.
     pub optimiser: Option<DeviceOptimiser>,
-    pub bytes: Bytes,
 }
 
 /// Adam's state: first moments of all blocks, then second moments. With what densification needs.
@@ -44,12 +44,7 @@ impl DeviceModel {
     ) -> Result<Self, GpuError> {
         let blocks = model.blocks().len() as u64;
         let rows = blocks * sh_rest_rows(model.sh_degree()) as u64;
-        let mut bytes = Bytes::default();
-        let mut storage = |what: &'static str, length: u64| -> Result<Buffer, GpuError> {
-            let buffer = context.storage(what, length)?;
-            bytes.add(what, &buffer);
-            Ok(buffer)
-        };
+        let storage = |what: &'static str, length: u64| context.storage(what, length);
         let parameters = storage("parameters", BLOCK_BYTES * blocks)?;
         let bands = storage("parameters", LANES_BYTES * rows)?;
         let state = match training {
@@ -63,11 +58,7 @@ impl DeviceModel {
             None => None,
         };
         context.check()?;
-        let write = |buffer: &Buffer, offset: u64, bytes: &[u8]| {
-            if !bytes.is_empty() {
-                context.queue.write_buffer(buffer, offset, bytes);
-            }
-        };
+        let write = |buffer: &Buffer, offset: u64, bytes: &[u8]| context.write(buffer, offset, bytes);
         write(&parameters, 0, cast_slice(model.blocks()));
         write(&bands, 0, cast_slice(model.rest()));
         if let (Some(device), Some((host, statistics))) = (&state, training) {
@@ -83,7 +74,25 @@ impl DeviceModel {
         context.queue.submit([]);
         context.check()?;
         let (gaussians, sh_degree) = (model.len() as u32, model.sh_degree());
-        Ok(Self { parameters, bands, gaussians, sh_degree, optimiser: state, bytes })
+        Ok(Self { parameters, bands, gaussians, sh_degree, optimiser: state })
+    }
+
+    /// Blocks of 16 Gaussians, of which the last may not be full.
+    pub fn blocks(&self) -> u64 {
+        u64::from(self.gaussians).div_ceil(LANES as u64)
+    }
+
+    /// Bytes of its buffers.
+    pub fn bytes(&self) -> Bytes {
+        let mut bytes = Bytes::default();
+        bytes.add("parameters", &self.parameters);
+        bytes.add("parameters", &self.bands);
+        if let Some(optimiser) = &self.optimiser {
+            let DeviceOptimiser { state, band_state, steps, statistics, ids } = optimiser;
+            [state, band_state, steps].into_iter().for_each(|buffer| bytes.add("optimiser", buffer));
+            [statistics, ids].into_iter().for_each(|buffer| bytes.add("densification", buffer));
+        }
+        bytes
     }
 
     /// Puts bytes of the two buffers into the model that was uploaded.
@@ -93,6 +102,32 @@ impl DeviceModel {
         let (blocks, rest) = (cast_slice_mut::<Block, u8>(blocks), cast_slice_mut::<Lanes, u8>(rest));
         blocks.copy_from_slice(&parameters[..blocks.len()]);
         rest.copy_from_slice(&bands[..rest.len()]);
+    }
+
+    /// Copies back what decisions about the list are made of.
+    pub fn look(
+        &self,
+        context: &Context,
+        looks: Looks,
+        model: &mut Gaussians,
+        statistics: &mut ScreenStatistics,
+    ) -> Result<(), GpuError> {
+        let parameters = (&self.parameters, BLOCK_BYTES * self.blocks());
+        match (looks, &self.optimiser) {
+            (Looks::Nothing, _) => {}
+            (Looks::Seen, Some(device)) => {
+                let seen = (&device.statistics, STATISTICS_BYTES * self.blocks());
+                let [parameters, seen] = context.read([parameters, seen])?;
+                cast_slice_mut::<Block, u8>(model.parts_mut().0).copy_from_slice(&parameters);
+                statistics.fit(model);
+                cast_slice_mut::<Lanes, u8>(statistics.rows_mut()).copy_from_slice(&seen);
+            }
+            (Looks::Parameters | Looks::Seen, _) => {
+                let [parameters] = context.read([parameters])?;
+                cast_slice_mut::<Block, u8>(model.parts_mut().0).copy_from_slice(&parameters);
+            }
+        }
+        Ok(())
     }
 
     /// Copies what training changed back.

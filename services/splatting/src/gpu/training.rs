@@ -1,6 +1,6 @@
 //! Training on the GPU: iterations are queued, recorded several at a time, and tell their losses when they have them.
 
-use std::collections::{BTreeMap, VecDeque};
+use std::collections::VecDeque;
 
 use bytemuck::{bytes_of, pod_collect_to_vec};
 use wgpu::{BindGroup, Buffer, BufferUsages, ComputePass, ComputePassDescriptor};
@@ -12,7 +12,7 @@ use super::error::GpuError;
 use super::iteration::{Counts, Iteration, job};
 use super::job::{STRIDE, fold};
 use super::kernels::Kernels;
-use super::keyframe::DeviceKeyframe;
+use super::keyframe::{DeviceKeyframe, Keyframes};
 use super::model::DeviceModel;
 use crate::densify::Noise;
 use crate::settings::{LossTerms, TrainingSettings};
@@ -23,13 +23,11 @@ const ITERATIONS: usize = 16;
 /// Submissions that may be under way; then the host waits for the oldest.
 const AHEAD: usize = 3;
 /// Words of an iteration in the ring of terms.
-const RING_WORDS: usize = 12;
-/// Most bytes that keyframes take; the one not used for longest goes first.
-const KEYFRAMES_MAX: u64 = 512 << 20;
+pub(super) const RING_WORDS: usize = 12;
 
 /// A stage of an iteration, as the CPU engine names them.
 #[derive(Clone, Copy)]
-enum Stage {
+pub(super) enum Stage {
     Listing(Listing),
     Blend,
     Loss,
@@ -40,7 +38,7 @@ enum Stage {
 
 /// What takes the gradients of an iteration.
 #[derive(Clone, Copy)]
-enum Last<'a> {
+pub(super) enum Last<'a> {
     /// A step, and what belongs to it.
     Step(&'a Iteration),
     /// The buffers of the caller; nothing moves.
@@ -51,7 +49,7 @@ enum Last<'a> {
 pub(super) const STAGES: usize = 7;
 
 impl Stage {
-    const ALL: [Self; STAGES] = [
+    pub const ALL: [Self; STAGES] = [
         Self::Listing(Listing::Project),
         Self::Listing(Listing::Sort),
         Self::Listing(Listing::Bin),
@@ -60,13 +58,6 @@ impl Stage {
         Self::Backward,
         Self::Adam,
     ];
-}
-
-/// A loss and its gradient, as bytes in the layout of the model.
-pub(super) struct Gradients {
-    pub terms: LossTerms,
-    pub parameters: Vec<u8>,
-    pub bands: Vec<u8>,
 }
 
 /// Iterations on their way.
@@ -78,12 +69,12 @@ struct Flight {
 
 /// Everything that a model under training has on the GPU, besides the model.
 pub(super) struct Trainer {
-    chain: Chain,
-    jobs: Buffer,
-    views: Buffer,
-    ring: Buffer,
+    pub(super) chain: Chain,
+    pub(super) jobs: Buffer,
+    pub(super) views: Buffer,
+    pub(super) ring: Buffer,
     /// Sums of ten moments of every Gaussian.
-    gradients: Buffer,
+    pub(super) gradients: Buffer,
     blend: BindGroup,
     ssim: BindGroup,
     loss: BindGroup,
@@ -98,40 +89,6 @@ pub(super) struct Trainer {
     flights: VecDeque<Flight>,
     idle: Vec<Buffer>,
     finished: VecDeque<LossTerms>,
-    /// Iterations that were recorded, to know which keyframe was used last.
-    recorded: u64,
-}
-
-/// Keyframes by [`TrainingView::id`].
-#[derive(Default)]
-pub(super) struct Keyframes {
-    held: BTreeMap<u64, DeviceKeyframe>,
-}
-
-impl Keyframes {
-    pub fn bytes(&self) -> u64 {
-        self.held.values().map(|keyframe| keyframe.bytes).sum()
-    }
-
-    /// Makes sure that a keyframe is there, and room for it.
-    fn hold(&mut self, context: &Context, kernels: &Kernels, view: &TrainingView, now: u64) -> Result<(), GpuError> {
-        if !self.held.contains_key(&view.id()) {
-            let keyframe = DeviceKeyframe::upload(context, kernels, view)?;
-            while self.bytes() + keyframe.bytes > KEYFRAMES_MAX {
-                let oldest = self.held.iter().min_by_key(|(_, keyframe)| keyframe.used).map(|(&id, _)| id);
-                match oldest {
-                    // What was recorded keeps its buffers alive.
-                    Some(id) => self.held.remove(&id),
-                    None => break,
-                };
-            }
-            self.held.insert(view.id(), keyframe);
-        }
-        if let Some(keyframe) = self.held.get_mut(&view.id()) {
-            keyframe.used = now;
-        }
-        Ok(())
-    }
 }
 
 impl Trainer {
@@ -230,7 +187,6 @@ impl Trainer {
             flights: VecDeque::new(),
             idle: Vec::new(),
             finished: VecDeque::new(),
-            recorded: 0,
         })
     }
 
@@ -251,7 +207,6 @@ impl Trainer {
     pub fn inherit(&mut self, other: &mut Self) {
         self.finished = std::mem::take(&mut other.finished);
         self.waiting = std::mem::take(&mut other.waiting);
-        self.recorded = other.recorded;
     }
 
     /// Asks for an iteration; submits once more than enough are waiting. The last one waits for what may follow it.
@@ -263,8 +218,7 @@ impl Trainer {
         (view, observed): (&TrainingView, bool),
         settings: &TrainingSettings,
     ) -> Result<(), GpuError> {
-        self.recorded += 1;
-        keyframes.hold(context, kernels, view, self.recorded)?;
+        keyframes.hold(context, kernels, view)?;
         self.waiting.push(Iteration::new(view, settings, observed));
         if self.waiting.len() > ITERATIONS {
             self.submit_batch(context, kernels, model, keyframes);
@@ -323,7 +277,7 @@ impl Trainer {
     }
 
     /// Records the dispatches of one iteration, of which `last` takes the gradients.
-    fn record(
+    pub(super) fn record(
         &self,
         pass: &mut ComputePass<'_>,
         kernels: &Kernels,
@@ -336,7 +290,7 @@ impl Trainer {
         }
     }
 
-    fn record_stage(
+    pub(super) fn record_stage(
         &self,
         stage: Stage,
         pass: &mut ComputePass<'_>,
@@ -382,47 +336,6 @@ impl Trainer {
                 dispatch(pass, &kernels.metrics, &self.metrics, offsets, (1, 1, 1));
             }
         }
-    }
-
-    /// Runs one iteration with every stage in a pass of its own, and tells how long each took on the GPU, seconds. Nothing
-    /// may be under way, and room for the pairs must be known. Needs timestamps.
-    pub fn profile(
-        &mut self,
-        context: &Context,
-        kernels: &Kernels,
-        (model, keyframes): (&DeviceModel, &mut Keyframes),
-        view: &TrainingView,
-        settings: &TrainingSettings,
-    ) -> Result<[f64; STAGES], GpuError> {
-        const STAMPS: u32 = 2 * STAGES as u32;
-        keyframes.hold(context, kernels, view, self.recorded)?;
-        let Some(keyframe) = keyframes.held.get(&view.id()) else { return Ok([f64::NAN; STAGES]) };
-        let iteration = Iteration::new(view, settings, false);
-        context.queue.write_buffer(&self.jobs, 0, bytes_of(&job(self.chain.size, model, 0, &iteration)));
-        context.queue.write_buffer(&self.views, 0, bytes_of(&iteration.view));
-        let stamps = context.device.create_query_set(&wgpu::QuerySetDescriptor {
-            label: None,
-            ty: wgpu::QueryType::Timestamp,
-            count: STAMPS,
-        });
-        let bytes = 8 * u64::from(STAMPS);
-        let resolved = context.buffer("timestamps", bytes, BufferUsages::QUERY_RESOLVE | BufferUsages::COPY_SRC);
-        let mut encoder = context.encoder();
-        for (at, stage) in (0..).zip(Stage::ALL) {
-            let timestamp_writes = Some(wgpu::ComputePassTimestampWrites {
-                query_set: &stamps,
-                beginning_of_pass_write_index: Some(2 * at),
-                end_of_pass_write_index: Some(2 * at + 1),
-            });
-            let mut pass = encoder.begin_compute_pass(&ComputePassDescriptor { label: None, timestamp_writes });
-            self.record_stage(stage, &mut pass, kernels, keyframe, &[0, 0], Last::Step(&iteration));
-        }
-        encoder.resolve_query_set(&stamps, 0..STAMPS, &resolved, 0);
-        context.queue.submit([encoder.finish()]);
-        let [ticks] = context.read([(&resolved, bytes)])?;
-        let ticks: Vec<u64> = pod_collect_to_vec(&ticks);
-        let period_s = 1e-9 * f64::from(context.queue.get_timestamp_period());
-        Ok(std::array::from_fn(|at| ticks[2 * at + 1].saturating_sub(ticks[2 * at]) as f64 * period_s))
     }
 
     /// Takes in what has come back; with `all`, waits for all of it, else only for what is too far behind. Returns how
@@ -483,7 +396,7 @@ impl Trainer {
         Ok(most)
     }
 
-    fn terms(&self, words: &[u32], iteration: &Iteration) -> LossTerms {
+    pub(super) fn terms(&self, words: &[u32], iteration: &Iteration) -> LossTerms {
         let sum = |k: usize| f64::from(f32::from_bits(words[k]));
         let Counts { samples, foreground, free, with_depth } = iteration.counts;
         let per = |value: f64, count: usize| if count == 0 { 0.0 } else { value / count as f64 };
@@ -506,51 +419,5 @@ impl Trainer {
     /// Terms of iterations that are over, in their order.
     pub fn take_finished(&mut self) -> Vec<LossTerms> {
         self.finished.drain(..).collect()
-    }
-
-    /// The loss of a keyframe and its gradient by every parameter, without a step: parameters and bands as the model has
-    /// them. `Err` holds how many pairs must have room where lists did not fit.
-    pub fn gradient(
-        &mut self,
-        context: &Context,
-        kernels: &Kernels,
-        (model, keyframes): (&DeviceModel, &mut Keyframes),
-        view: &TrainingView,
-        settings: &TrainingSettings,
-    ) -> Result<Result<Gradients, u32>, GpuError> {
-        keyframes.hold(context, kernels, view, self.recorded)?;
-        let iteration = Iteration::new(view, settings, false);
-        let out = context.storage("gradients", model.parameters.size())?;
-        let bands_out = context.storage("gradients", model.bands.size())?;
-        let group = kernels.gradient.bind(
-            context,
-            1,
-            &[
-                &self.jobs,
-                &self.views,
-                &model.parameters,
-                &model.bands,
-                &self.gradients,
-                &out,
-                &bands_out,
-                &self.chain.control,
-            ],
-        );
-        context.queue.write_buffer(&self.jobs, 0, bytes_of(&job(self.chain.size, model, 0, &iteration)));
-        context.queue.write_buffer(&self.views, 0, bytes_of(&iteration.view));
-        let mut encoder = context.encoder();
-        let mut pass = encoder.begin_compute_pass(&ComputePassDescriptor::default());
-        if let Some(keyframe) = keyframes.held.get(&iteration.keyframe) {
-            self.record(&mut pass, kernels, keyframe, &[0, 0], Last::Gradient(&group));
-        }
-        drop(pass);
-        context.queue.submit([encoder.finish()]);
-        let [words, parameters, bands] =
-            context.read([(&self.ring, 4 * RING_WORDS as u64), (&out, out.size()), (&bands_out, bands_out.size())])?;
-        let words: Vec<u32> = pod_collect_to_vec(&words);
-        Ok(match words[8] {
-            0 => Err(words[9]),
-            _ => Ok(Gradients { terms: self.terms(&words, &iteration), parameters, bands }),
-        })
     }
 }

@@ -24,6 +24,8 @@ pub struct PruneRules {
 /// A depth image and where it was taken.
 #[derive(Debug, Clone, Copy)]
 pub struct DepthView<'a> {
+    /// Names image and camera among all that a model is pruned by, as long as it is trained: a GPU keeps them by it.
+    pub id: u64,
     /// The camera at the image's size.
     pub camera: &'a Camera,
     /// Centre z, metres, 0 = no measurement.
@@ -160,7 +162,8 @@ mod tests {
         ]
         .into_iter()
         .collect();
-        let views: Vec<DepthView<'_>> = cameras.iter().map(|camera| DepthView { camera, depth_m: &wall }).collect();
+        let views: Vec<DepthView<'_>> =
+            cameras.iter().zip(0..).map(|(camera, id)| DepthView { id, camera, depth_m: &wall }).collect();
         assert_eq!(keep(&model, &views, &rules()), [false, true, true], "behind the wall is not before it");
         assert_eq!(keep(&model, &views[..1], &rules()), [true; 3], "one view is not enough");
         assert_eq!(keep(&model, &views, &PruneRules { front_views: 0, ..rules() }), [true; 3]);
@@ -168,7 +171,7 @@ mod tests {
         let (uv, _) = cameras[0].project(Vec3::new(0.0, -0.5, 0.0)).unwrap();
         let mut holed = wall.clone();
         holed[uv.y as usize * 64 + uv.x as usize + 1] = 0.0;
-        let views = [DepthView { camera: &cameras[0], depth_m: &holed }, views[1]];
+        let views = [DepthView { id: 2, camera: &cameras[0], depth_m: &holed }, views[1]];
         assert_eq!(keep(&model, &views, &rules()), [true; 3]);
     }
 

@@ -19,7 +19,7 @@ fn statistics(rows: &[[f32; 3]]) -> ScreenStatistics {
 }
 
 /// A model with bands of its own for each Gaussian, an optimiser with three steps for each, random statistics.
-pub(super) fn trained(count: usize, seed: u64) -> (Gaussians, Optimiser, ScreenStatistics) {
+pub(crate) fn trained(count: usize, seed: u64) -> (Gaussians, Optimiser, ScreenStatistics) {
     let mut random = Random(seed);
     let mut model = Gaussians::with_sh_degree(1);
     for g in scene(count, seed).iter() {

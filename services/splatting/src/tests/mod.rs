@@ -1,6 +1,6 @@
 //! The engine against the reference, and against itself on other instruction sets and thread counts.
 
-mod densify;
+pub(crate) mod densify;
 mod densify_training;
 mod edges;
 pub(crate) mod forward;

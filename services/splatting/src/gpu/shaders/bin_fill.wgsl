@@ -14,7 +14,11 @@ fn main(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lo
     let view = group.z;
     let base = view * job.gaussians;
     let splats = control[CONTROL_VISIBLE + view];
-    let part = (splats + job.bin_groups - 1u) / job.bin_groups;
+    let groups = bin_groups_for(splats);
+    if group.x >= groups {
+        return;
+    }
+    let part = (splats + groups - 1u) / groups;
     let begin = min(group.x * part, splats);
     let end = min(begin + part, splats);
     let tiles = job.tiles_x * job.tiles_y;

@@ -18,9 +18,10 @@ fn main(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lo
     let first = min(local * per_thread, tiles);
     let last = min(first + per_thread, tiles);
     let base = view * job.bin_groups * tiles;
+    let groups = bin_groups_for(atomicLoad(&control[CONTROL_VISIBLE + view]));
     var total = 0u;
     for (var tile = first; tile < last; tile++) {
-        for (var part = 0u; part < job.bin_groups; part++) {
+        for (var part = 0u; part < groups; part++) {
             total += table[base + part * tiles + tile];
         }
     }
@@ -35,7 +36,7 @@ fn main(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) lo
     var at = scan[local] - total;
     for (var tile = first; tile < last; tile++) {
         starts[view * (tiles + 1u) + tile] = min(at, job.capacity);
-        for (var part = 0u; part < job.bin_groups; part++) {
+        for (var part = 0u; part < groups; part++) {
             let place = base + part * tiles + tile;
             let count = table[place];
             table[place] = at;

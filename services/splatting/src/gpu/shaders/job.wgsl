@@ -21,7 +21,7 @@ struct View {
 /// Sizes of a chain, and the settings of a training step.
 struct Job {
     gaussians: u32,
-    /// Workgroups that share a pass of the sort, and that share the splats of the binning.
+    /// Most workgroups that share a pass of the sort, and that share the splats of the binning; see `groups.wgsl`.
     sort_groups: u32,
     bin_groups: u32,
     /// (tile, splat) pairs that a view has room for.

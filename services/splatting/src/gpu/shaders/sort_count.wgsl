@@ -1,7 +1,7 @@
 // Radix sort by depth, first half of a pass: how often each value of eight bits occurs in the part of each workgroup.
 //
-// Least significant digit first, four passes, stable. The number of drawn Gaussians is known to the GPU alone, so each of
-// a fixed number of workgroups takes an equal part of however many there are. The first pass reads all Gaussians in their
+// Least significant digit first, four passes, stable. Each workgroup takes an equal part of however many keys there are (see
+// `groups.wgsl`). The first pass reads all Gaussians in their
 // order and skips those that are not drawn, which is the compaction. Two dispatches a pass instead of three: the scan over
 // workgroups is so short that every workgroup of the second half repeats it.
 
@@ -22,7 +22,11 @@ var<workgroup> histogram: array<atomic<u32>, 256>;
 fn main(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) local: u32) {
     let view = group.z;
     let items = select(control[CONTROL_VISIBLE + view], job.gaussians, pass_.is_first != 0u);
-    let part = (items + job.sort_groups * 256u - 1u) / (job.sort_groups * 256u) * 256u;
+    let groups = sort_groups_for(items);
+    if group.x >= groups {
+        return;
+    }
+    let part = (items + groups * 256u - 1u) / (groups * 256u) * 256u;
     let end = min((group.x + 1u) * part, items);
     atomicStore(&histogram[local], 0u);
     workgroupBarrier();

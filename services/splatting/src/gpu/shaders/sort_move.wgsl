@@ -15,6 +15,8 @@ struct Pass {
 @group(0) @binding(4) var<storage, read_write> control: array<u32>;
 @group(0) @binding(5) var<storage, read_write> keys_out: array<u32>;
 @group(0) @binding(6) var<storage, read_write> order_out: array<u32>;
+/// Workgroups of the next passes, and from word 4 on of the binning, three numbers each.
+@group(0) @binding(7) var<storage, read_write> arguments: array<u32>;
 @group(1) @binding(0) var<uniform> pass_: Pass;
 
 /// Digit of a key that is not drawn.
@@ -31,19 +33,27 @@ struct Item {
     digit: u32,
 }
 
-/// Keys of each workgroup, a multiple of a chunk.
-fn part_of(view: u32) -> vec2u {
-    // Keys that are left, in all.
+/// How a pass is shared.
+struct Share {
+    /// Keys of each workgroup, a multiple of a chunk.
+    part: u32,
+    /// Keys that are left, in all.
+    items: u32,
+    groups: u32,
+}
+
+fn share_of(view: u32) -> Share {
     let items = select(control[CONTROL_VISIBLE + view], job.gaussians, pass_.is_first != 0u);
-    let chunk = job.sort_groups * 256u;
-    return vec2u((items + chunk - 1u) / chunk * 256u, items);
+    let groups = sort_groups_for(items);
+    let chunk = groups * 256u;
+    return Share((items + chunk - 1u) / chunk * 256u, items, groups);
 }
 
 /// Finds where each digit of this workgroup begins: one thread per digit.
-fn begin(view: u32, group: u32, local: u32) {
+fn begin(view: u32, groups: u32, group: u32, local: u32) {
     var before = 0u;
     var total = 0u;
-    for (var other = 0u; other < job.sort_groups; other++) {
+    for (var other = 0u; other < groups; other++) {
         let count = counts[(view * job.sort_groups + other) * 256u + local];
         before += select(0u, count, other < group);
         total += count;
@@ -60,10 +70,21 @@ fn begin(view: u32, group: u32, local: u32) {
     workgroupBarrier();
 }
 
-/// Tells the following passes how many keys are left. Not before every thread has read what `part_of` reads.
+/// Tells the following passes how many keys are left, and how many workgroups that is. Not before every thread has read what
+/// `share_of` reads.
 fn finish(view: u32, group: u32, local: u32) {
     if pass_.is_first != 0u && group == 0u && local == 0u {
-        control[CONTROL_VISIBLE + view] = scan[255];
+        let visible = scan[255];
+        control[CONTROL_VISIBLE + view] = visible;
+        // Chains of many views are dispatched by what any of them could need.
+        if view == 0u {
+            arguments[0] = sort_groups_for(visible);
+            arguments[1] = 1u;
+            arguments[2] = 1u;
+            arguments[4] = bin_groups_for(visible);
+            arguments[5] = (job.tiles_x * job.tiles_y + 255u) / 256u;
+            arguments[6] = 1u;
+        }
     }
 }
 

@@ -6,10 +6,13 @@ var<workgroup> digits: array<vec4u, 64>;
 @compute @workgroup_size(256)
 fn main(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) local: u32) {
     let view = group.z;
-    let part = part_of(view);
-    let end = min((group.x + 1u) * part.x, part.y);
-    begin(view, group.x, local);
-    for (var first = group.x * part.x; first < end; first += 256u) {
+    let share = share_of(view);
+    if group.x >= share.groups {
+        return;
+    }
+    let end = min((group.x + 1u) * share.part, share.items);
+    begin(view, share.groups, group.x, local);
+    for (var first = group.x * share.part; first < end; first += 256u) {
         let item = item_at(view, first + local, end);
         digits[local / 4u][local % 4u] = item.digit;
         workgroupBarrier();

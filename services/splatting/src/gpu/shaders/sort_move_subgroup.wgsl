@@ -41,11 +41,14 @@ fn main(
     @builtin(subgroup_invocation_id) lane: u32,
 ) {
     let view = group.z;
-    let part = part_of(view);
-    let end = min((group.x + 1u) * part.x, part.y);
-    begin(view, group.x, local);
+    let share = share_of(view);
+    if group.x >= share.groups {
+        return;
+    }
+    let end = min((group.x + 1u) * share.part, share.items);
+    begin(view, share.groups, group.x, local);
     let position = subgroup * size + lane;
-    for (var first = group.x * part.x; first < end; first += 256u) {
+    for (var first = group.x * share.part; first < end; first += 256u) {
         let item = item_at(view, first + position, end);
         var same = subgroupBallot(true);
         for (var bit = 0u; bit < 9u; bit++) {

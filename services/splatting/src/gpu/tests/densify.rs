@@ -22,17 +22,17 @@ fn still() -> TrainingSettings {
     }
 }
 
-fn on(backend: impl Into<Backend>, start: &Gaussians) -> Training {
+pub(super) fn on(backend: impl Into<Backend>, start: &Gaussians) -> Training {
     let mut training = Training::new(backend);
     training.restore(start.clone(), Optimiser::new());
     training
 }
 
-fn gpu(options: &Options) -> Backend {
+pub(super) fn gpu(options: &Options) -> Backend {
     Backend::Gpu(Box::new(Engine::new(options).unwrap()))
 }
 
-fn cpu() -> crate::Engine {
+pub(super) fn cpu() -> crate::Engine {
     crate::Engine::new(1).unwrap()
 }
 
@@ -78,7 +78,7 @@ fn noise_is_the_same_numbers_wherever_it_is_made() {
         training.step(&views[0], &still()).unwrap();
         training.add_noise(&noise(1)).unwrap();
         training.step(&views[1], &still()).unwrap();
-        // On the host, for the step is over.
+        // At once, for the step is over.
         training.sync().unwrap();
         training.add_noise(&noise(2)).unwrap();
         training.sync().unwrap();

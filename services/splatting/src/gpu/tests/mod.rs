@@ -5,7 +5,9 @@
 
 mod check;
 mod densify;
+mod dispatches;
 mod edges;
+mod editing;
 mod forward;
 mod gradients;
 mod scoring;

@@ -1,187 +1,17 @@
-//! One interface to both back ends: who trains and who scores do not know which one works.
+//! A model and its optimiser under training, on the CPU or on a GPU.
 
-use std::fmt;
-use std::sync::atomic::AtomicBool;
-
-use thiserror::Error;
-
-use crate::camera::{Camera, RenderSettings};
+use super::{Backend, BackendError};
 use crate::densify::Noise;
-use crate::engine::{Engine, EngineError, MomentsView, Rendered};
+use crate::edit::{Draft, Edit, Looks};
 use crate::gpu::{self, GpuError};
 use crate::model::Gaussians;
 use crate::optimiser::Optimiser;
+use crate::rgbd::prune::{self, DepthView, PruneRules};
 use crate::settings::{LossTerms, TrainingSettings};
 use crate::simd::Isa;
 use crate::statistics::ScreenStatistics;
-use crate::uncertainty::{Uncertainty, UncertaintySettings, uncertainty};
 use crate::view::TrainingView;
 use crate::workers::Workers;
-
-/// What is asked for.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub enum BackendKind {
-    /// A GPU where there is a real one, else the CPU.
-    #[default]
-    Auto,
-    /// The CPU engine.
-    Cpu,
-    /// A GPU, or an error.
-    Gpu,
-}
-
-/// Which back end, and how it is to work.
-#[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct BackendOptions {
-    /// Which.
-    pub kind: BackendKind,
-    /// Name of the GPU's adapter, or a part of it; `None`: the best that is not software.
-    pub adapter: Option<String>,
-    /// Whether sums on a GPU have an order, so that training repeats bit for bit; on the CPU it always does.
-    pub deterministic: bool,
-    /// Threads of the CPU engine.
-    pub threads: usize,
-}
-
-/// Why a back end cannot be had, or stopped working.
-#[derive(Debug, Error)]
-pub enum BackendError {
-    /// The CPU engine.
-    #[error(transparent)]
-    Cpu(EngineError),
-    /// The GPU. What was on it is gone.
-    #[error(transparent)]
-    Gpu(GpuError),
-    /// The caller's flag was set before all views were done.
-    #[error("cancelled before all views were rendered")]
-    Cancelled,
-}
-
-impl From<EngineError> for BackendError {
-    fn from(error: EngineError) -> Self {
-        match error {
-            EngineError::Cancelled => Self::Cancelled,
-            error @ EngineError::Threads(_) => Self::Cpu(error),
-        }
-    }
-}
-
-impl From<GpuError> for BackendError {
-    fn from(error: GpuError) -> Self {
-        match error {
-            GpuError::Cancelled => Self::Cancelled,
-            error => Self::Gpu(error),
-        }
-    }
-}
-
-/// Which back end works.
-pub enum Backend {
-    /// The CPU engine.
-    Cpu(Box<Engine>),
-    /// A GPU.
-    Gpu(Box<gpu::Engine>),
-}
-
-impl fmt::Display for Backend {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Self::Cpu(engine) => write!(f, "cpu-{}", format!("{:?}", engine.isa()).to_lowercase()),
-            Self::Gpu(engine) => write!(f, "gpu {}", engine.name()),
-        }
-    }
-}
-
-impl fmt::Debug for Backend {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "Backend({self})")
-    }
-}
-
-impl From<Engine> for Backend {
-    fn from(engine: Engine) -> Self {
-        Self::Cpu(Box::new(engine))
-    }
-}
-
-impl Backend {
-    /// The back end that is asked for. With [`BackendKind::Auto`] the second value says why it is not a GPU.
-    ///
-    /// # Errors
-    /// Where it is not there or does not work.
-    pub fn new(wanted: &BackendOptions) -> Result<(Self, Option<GpuError>), BackendError> {
-        let gpu = || {
-            let (adapter, deterministic) = (wanted.adapter.clone(), wanted.deterministic);
-            let options = gpu::Options { adapter, deterministic, ..gpu::Options::default() };
-            gpu::Engine::new(&options).map(|engine| Self::Gpu(Box::new(engine)))
-        };
-        let cpu = || Engine::new(wanted.threads).map(Self::from);
-        Ok(match wanted.kind {
-            BackendKind::Cpu => (cpu()?, None),
-            BackendKind::Gpu => (gpu()?, None),
-            // A driver takes a while to load, even to find that there is nothing to drive.
-            BackendKind::Auto if wanted.adapter.is_none() && !gpu::may_exist() => (cpu()?, Some(GpuError::NoAdapter)),
-            BackendKind::Auto => match gpu() {
-                Ok(gpu) => (gpu, None),
-                // Who names an adapter wants that one.
-                Err(error @ GpuError::NoSuchAdapter { .. }) => return Err(error.into()),
-                Err(error) => (cpu()?, Some(error)),
-            },
-        })
-    }
-
-    /// Bytes allocated on the GPU, by what for; nothing on the CPU.
-    pub fn gpu_bytes(&self) -> Vec<(&'static str, u64)> {
-        match self {
-            Self::Cpu(_) => Vec::new(),
-            Self::Gpu(engine) => engine.bytes(),
-        }
-    }
-
-    /// As [`Engine::render`].
-    ///
-    /// # Errors
-    /// Where the GPU fails.
-    pub fn render(
-        &mut self,
-        gaussians: &Gaussians,
-        camera: &Camera,
-        settings: &RenderSettings,
-        out: &mut Rendered,
-    ) -> Result<(), BackendError> {
-        match self {
-            Self::Cpu(engine) => engine.render(gaussians, camera, settings, out),
-            Self::Gpu(engine) => engine.render(gaussians, camera, settings, out)?,
-        }
-        Ok(())
-    }
-
-    /// How uncertain the model is about each of many views (Eq. 1-3): given to `visit` with the view's index, in no order
-    /// and from many threads. On the CPU one view is rendered and summed by one thread, so that the bits do not depend on
-    /// their number.
-    ///
-    /// # Errors
-    /// [`BackendError::Cancelled`] where `cancel` became true, or where the GPU fails.
-    pub fn uncertainties(
-        &mut self,
-        gaussians: &Gaussians,
-        cameras: &[Camera],
-        (settings, render): (&UncertaintySettings, &RenderSettings),
-        cancel: &AtomicBool,
-        visit: impl Fn(usize, Uncertainty) + Sync,
-    ) -> Result<(), BackendError> {
-        match self {
-            Self::Cpu(engine) => {
-                let views: Vec<MomentsView> = cameras.iter().map(|camera| settings.view(camera)).collect();
-                engine.moments_batch(gaussians, &views, render, cancel, |index, moments| {
-                    visit(index, uncertainty(settings, &cameras[index], moments));
-                })?;
-            }
-            Self::Gpu(engine) => engine.uncertainties(gaussians, cameras, (settings, render), cancel, visit)?,
-        }
-        Ok(())
-    }
-}
 
 /// Where the newest state of a model under training is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -205,7 +35,8 @@ enum Copy {
 /// A model and its optimiser under training, wherever they are.
 ///
 /// On the CPU a step is done when it returns. On a GPU it is done later: losses arrive with [`Training::finished`], and the
-/// model here is that of the last [`Training::sync`].
+/// model here is that of the last [`Training::sync`]: but how many Gaussians there are, their ids and birth rounds are always
+/// known.
 #[derive(Debug)]
 pub struct Training {
     backend: Backend,
@@ -297,15 +128,6 @@ impl Training {
         Ok(())
     }
 
-    /// Model and optimiser, to change both alike.
-    ///
-    /// # Errors
-    /// As [`Training::sync`].
-    pub fn parts_mut(&mut self) -> Result<(&mut Gaussians, &mut Optimiser), BackendError> {
-        let (model, optimiser, _) = self.lists_mut()?;
-        Ok((model, optimiser))
-    }
-
     /// Model, optimiser and statistics, to change all alike.
     ///
     /// # Errors
@@ -317,6 +139,78 @@ impl Training {
         self.optimiser.fit(&self.gaussians);
         self.statistics.fit(&self.gaussians);
         Ok((&mut self.gaussians, &mut self.optimiser, &mut self.statistics))
+    }
+
+    /// Changes the list of Gaussians: `change` sees and alters their parameters, and what lies beside them follows. A
+    /// model on a GPU stays there: 56 bytes a Gaussian come down to be decided about, 4 go back, and the parameters of
+    /// those that are new.
+    ///
+    /// # Errors
+    /// Where the GPU fails: then the newest state is lost, and what is here is older.
+    pub fn edit<R>(&mut self, change: impl FnOnce(&mut Draft<'_>) -> R) -> Result<R, BackendError> {
+        self.edit_looking(Looks::Parameters, change)
+    }
+
+    /// The same, where `change` looks at no more than it says.
+    pub(crate) fn edit_looking<R>(
+        &mut self,
+        looks: Looks,
+        change: impl FnOnce(&mut Draft<'_>) -> R,
+    ) -> Result<R, BackendError> {
+        if let (Newest::Gpu, Backend::Gpu(engine)) = (self.newest, &mut self.backend) {
+            engine.look(looks, &mut self.gaussians, &mut self.statistics)?;
+        } else {
+            self.optimiser.fit(&self.gaussians);
+            self.statistics.fit(&self.gaussians);
+        }
+        let mut draft = Draft::new(&mut self.gaussians, &self.statistics);
+        let result = change(&mut draft);
+        let edit = draft.finish();
+        self.follow(&edit)?;
+        Ok(result)
+    }
+
+    /// Removes what is wrong by these rules. Where the model is on a GPU its kernels decide, and ask this code about what
+    /// rounding could decide otherwise: the result is the same as here.
+    ///
+    /// # Errors
+    /// As [`Training::edit`].
+    pub fn prune(&mut self, views: &[DepthView<'_>], rules: &PruneRules) -> Result<(), BackendError> {
+        let kept = match (self.newest, &mut self.backend) {
+            (Newest::Gpu | Newest::Both, Backend::Gpu(engine)) => engine.keep(views, rules)?,
+            _ => prune::keep(&self.gaussians, views, rules),
+        };
+        self.edit_looking(Looks::Nothing, |draft| draft.retain(|index| kept.get(index).copied().unwrap_or(false)))
+    }
+
+    /// Does to everything beside the parameters what was done to them: where it is, or, where it is in two places, in both.
+    fn follow(&mut self, edit: &Edit) -> Result<(), BackendError> {
+        if *edit == Edit::default() {
+            return Ok(());
+        }
+        if edit.sources.is_some() {
+            self.forget_copy();
+        }
+        if self.newest != Newest::Gpu {
+            if let Some(sources) = &edit.sources {
+                self.optimiser.follow(sources);
+                self.statistics.follow(sources);
+            }
+            if edit.forgets_statistics {
+                self.statistics.reset();
+            }
+            if edit.logit_ceiling.is_some() {
+                self.optimiser.reset_opacities();
+            }
+        }
+        match (self.newest, &mut self.backend) {
+            (Newest::Gpu, Backend::Gpu(engine)) => engine.edit(edit, &self.gaussians)?,
+            (Newest::Both, Backend::Gpu(engine)) => {
+                engine.edit(edit, &self.gaussians).inspect_err(|_| self.newest = Newest::Host)?;
+            }
+            _ => {}
+        }
+        Ok(())
     }
 
     /// Begins to copy the model as the steps asked for so far leave it, while training goes on. What changes the list of
@@ -395,13 +289,11 @@ impl Training {
     pub(crate) fn add_noise(&mut self, noise: &Noise) -> Result<(), BackendError> {
         match &mut self.backend {
             Backend::Cpu(engine) => noise.add_to(&mut self.gaussians, engine.isa, &engine.workers),
-            Backend::Gpu(engine) => {
-                if !(self.newest == Newest::Gpu && engine.add_noise(noise)) {
-                    self.sync()?;
-                    noise.add_to(&mut self.gaussians, Isa::detect(), &Workers::sequential());
-                    self.newest = Newest::Host;
-                }
+            Backend::Gpu(engine) if self.newest != Newest::Host => {
+                self.newest = Newest::Gpu;
+                engine.add_noise(noise)?;
             }
+            Backend::Gpu(_) => noise.add_to(&mut self.gaussians, Isa::detect(), &Workers::sequential()),
         }
         Ok(())
     }
