@@ -164,6 +164,40 @@ fn a_round_changes_its_back_end_by_a_checkpoint() {
     }
 }
 
+/// What pruning and insertion leave on a GPU is, to the bit, what a checkpoint of it brings there.
+#[test]
+fn a_second_round_on_a_gpu_is_the_one_of_a_checkpoint() {
+    let test = "a_second_round_on_a_gpu_is_the_one_of_a_checkpoint";
+    let Some(adapter) = splatting::gpu::adapters().into_iter().next() else {
+        assert!(std::env::var_os("VANTAGE_EXPECT_GPU").is_none(), "no GPU adapter, but one was expected");
+        println!("{test}: skipped, no GPU adapter");
+        return;
+    };
+    let (kind, adapter) = (BackendKind::Gpu, Some(adapter.name));
+    let options = BackendOptions { kind, adapter, threads: 1, deterministic: true };
+    let mut source = Memory::new((48, 36));
+    let model = shared_types::config::ModelConfig { width: 48, height: 36, ..model_config() };
+    // So that something is pruned and the cap is reached.
+    let model = shared_types::config::ModelConfig { max_gaussians: 700, ..model };
+    let config = TrainerConfig { prune_opacity: 0.7, ..TrainerConfig::default() };
+    let ends = [false, true].map(|restored| {
+        let mut session = Session::new(config.clone(), model.clone(), Backend::new(&options).unwrap().0);
+        for (round, ids) in [&[0u64, 2, 4][..], &[0, 2, 4, 1, 5]].into_iter().enumerate() {
+            session.begin(spec(round as u32, 20, ids), &mut source).unwrap();
+            let inserted = session.model().len();
+            session.advance(20, || ()).unwrap();
+            session.finish().unwrap();
+            assert!(session.model().len() < inserted, "some are pruned of {inserted}");
+            if restored {
+                let bytes = checkpoint::to_bytes(&session);
+                checkpoint::from_bytes(&bytes).unwrap().restore_into(&mut session);
+            }
+        }
+        checkpoint::to_bytes(&session)
+    });
+    assert!(ends[0] == ends[1]);
+}
+
 #[test]
 fn the_newest_whole_checkpoint_wins() {
     let folder = tempfile::tempdir().unwrap();

@@ -10,6 +10,7 @@ mod edges;
 mod editing;
 mod forward;
 mod gradients;
+mod memory;
 mod scoring;
 mod training;
 
