@@ -100,11 +100,10 @@ fn on_the_walls_clock_stops_of_a_while_are_ridden_out() {
     assert!(step_m <= 0.3, "a setpoint jumped by {step_m} m");
 }
 
-/// SIGTERM to a service alone is no order to end the mission.
+/// SIGTERM to a service alone is no order to end the mission, but for those that fly.
 #[test]
 fn a_service_that_is_asked_to_end_is_started_again() {
-    const ASKED: [(usize, &str); 6] =
-        [(0, "keeper"), (1, "camera"), (2, "scorer"), (3, "world"), (4, "trainer"), (5, "planner")];
+    const ASKED: [(usize, &str); 5] = [(0, "keeper"), (1, "camera"), (2, "scorer"), (3, "world"), (4, "trainer")];
     let base = tempfile::tempdir().expect("folder");
     let folder = base.path().join("mission");
     let mut flight = start(&folder, &[]);
@@ -128,6 +127,21 @@ fn a_link_that_is_asked_to_end_in_the_air_lands_first_and_the_mission_goes_on() 
     flight.wait_until("the keyframes", |flight| keyframes(&flight.folder).len() >= 2);
     kill(flight.services()["px4-link"], "TERM");
     flight.finish_well();
+    assert_complete(&folder);
+}
+
+#[test]
+fn a_planner_that_is_asked_to_end_in_the_air_lands_first_and_leaves_the_mission_open() {
+    let base = tempfile::tempdir().expect("folder");
+    let folder = base.path().join("mission");
+    let mut flight = start(&folder, &[]);
+    flight.wait_until("the keyframes", |flight| keyframes(&flight.folder).len() >= 2);
+    kill(flight.services()["planner"], "TERM");
+    assert_eq!(flight.finish().code(), Some(1));
+    assert!(journal(&folder).iter().all(|entry| entry["event"] != "over"), "the mission is open");
+    let mut resume = vantage();
+    resume.arg("resume").arg(&folder);
+    Flight::spawn(&folder, resume).finish_well();
     assert_complete(&folder);
 }
 

@@ -84,6 +84,8 @@ pub struct Mission {
     pending: Option<Pending>,
     retry_ns: u64,
     refusals: u32,
+    /// Since when a failsafe acts without telling why.
+    unexplained_ns: Option<u64>,
     flight_failures: u32,
     flown: bool,
     scan_step: u32,
@@ -136,6 +138,7 @@ impl Mission {
             pending: None,
             retry_ns: 0,
             refusals: 0,
+            unexplained_ns: None,
             flight_failures: 0,
             flown: false,
             scan_step: 0,

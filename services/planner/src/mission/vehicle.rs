@@ -16,6 +16,8 @@ use crate::state::State;
 const LINK_LOST_S: f64 = 10.0;
 /// Link age from which nothing is asked of a vehicle in the air: px4-link decides nothing in such a silence either.
 const LINK_QUIET_NS: u64 = 500_000_000;
+/// How long a failsafe may stay without a reason, nanoseconds.
+const UNEXPLAINED_NS: u64 = 3_000_000_000;
 /// Refusals after which a command is not tried again.
 const MOST_REFUSALS: u32 = 3;
 
@@ -78,7 +80,12 @@ impl Mission {
         let failsafe = match FailsafeReason::from_code(vehicle.failsafe) {
             Some(FailsafeReason::Battery) => Some(EndReason::Battery),
             Some(FailsafeReason::Geofence) => Some(EndReason::Geofence),
-            Some(FailsafeReason::LinkLost | FailsafeReason::Other) => Some(EndReason::Link),
+            Some(FailsafeReason::LinkLost) => Some(EndReason::Link),
+            // The battery's own words come every two seconds, and may explain it yet.
+            Some(FailsafeReason::Other) => {
+                let since_ns = *self.unexplained_ns.get_or_insert(self.now_ns);
+                (self.now_ns - since_ns > UNEXPLAINED_NS).then_some(EndReason::Link)
+            }
             // px4-link takes control again by itself.
             Some(FailsafeReason::OffboardLost | FailsafeReason::None) | None => None,
         };
@@ -132,6 +139,11 @@ impl Mission {
         if !grounded && vehicle.link_age_ns > LINK_QUIET_NS {
             // Whoever cannot hear refuses nothing: it is waited for, until the link counts as lost.
             self.refusals = 0;
+            return State::Launching;
+        }
+        let comes_home = [FlightMode::Return.code(), FlightMode::Land.code()].contains(&vehicle.mode);
+        if comes_home && vehicle.armed == 1 && self.commanded_by_us() && self.pending.is_none() && !self.homeward() {
+            // px4-link brings it home by itself: it was told to end, or the planner had been away. Then it takes off again.
             return State::Launching;
         }
         if self.homeward() && grounded {

@@ -12,6 +12,9 @@ pub const GATHER_NS: u64 = 60_000_000_000;
 const STILL_NS: u64 = 2_000_000_000;
 /// A datagram that is still missing after this time is counted, and time goes on.
 const DATAGRAM_NS: u64 = 200_000_000;
+/// A member that has left may have been asked to, alone, and is started again: for so long time goes no faster than the
+/// wall's, so that it misses no deadline.
+const LEFT_NS: u64 = 2_000_000_000;
 /// The state is sent again this often.
 const RESEND_NS: u64 = 100_000_000;
 /// A tick of simulated time.
@@ -67,6 +70,7 @@ struct Member {
     seen: bool,
     is_in: bool,
     left: bool,
+    left_at_ns: u64,
     held: bool,
     /// The process of this life has ended.
     gone: bool,
@@ -75,6 +79,12 @@ struct Member {
 }
 
 impl Member {
+    fn leave(&mut self, leaving: bool, wall_ns: u64) {
+        if leaving && !core::mem::replace(&mut self.left, true) {
+            self.left_at_ns = wall_ns;
+        }
+    }
+
     fn waited_for(&self) -> bool {
         self.is_in && !self.left
     }
@@ -98,6 +108,8 @@ pub struct Lockstep {
     lost_datagrams: u64,
     foreign: bool,
     ever_out: bool,
+    /// A member has left just now.
+    just_left: bool,
 }
 
 impl Lockstep {
@@ -119,6 +131,7 @@ impl Lockstep {
             lost_datagrams: 0,
             foreign: false,
             ever_out: false,
+            just_left: false,
         }
     }
 
@@ -198,7 +211,7 @@ impl Lockstep {
         }
         if member.gone {
             // Its last words, read after its end was seen: all that they may still tell is that it meant to leave.
-            member.left |= grant.leaving;
+            member.leave(grant.leaving, wall_ns);
             return;
         }
         if member.granted != Some(grant.tick) || member.work != grant.work || member.held != grant.held {
@@ -207,7 +220,8 @@ impl Lockstep {
         member.work = grant.work;
         member.datagrams = grant.datagrams;
         member.held = grant.held;
-        member.left = grant.leaving;
+        member.left &= grant.leaving;
+        member.leave(grant.leaving, wall_ns);
         member.granted = Some(grant.tick);
         if grant.tick == tick {
             // Whoever was out and grants the present tick is in again.
@@ -238,6 +252,7 @@ impl Lockstep {
                 return if late { Phase::GatheringFailed(missing) } else { Phase::Gathering(missing) };
             }
         }
+        self.just_left = self.members.values().any(|m| m.left && wall_ns.saturating_sub(m.left_at_ns) < LEFT_NS);
         let mut waiting = Vec::new();
         for (&code, member) in &mut self.members {
             if !member.waited_for() || member.granted == Some(tick) {
@@ -280,12 +295,12 @@ impl Lockstep {
         false
     }
 
-    /// Earliest wall time of the next tick; real time at most while a member is out, all have left, or a foreign client
-    /// flies.
+    /// Earliest wall time of the next tick; real time at most while a member is out or has just left, all have left, or a
+    /// foreign client flies.
     fn not_before(&self) -> Option<u64> {
         let out = self.members.values().any(|m| !m.is_in && !m.left);
         let alone = !self.members.values().any(Member::waited_for);
-        let speed = match (out || alone || self.foreign, self.speed) {
+        let speed = match (out || alone || self.just_left || self.foreign, self.speed) {
             (true, s) if s == 0.0 || s > 1.0 => 1.0,
             (_, s) => s,
         };
