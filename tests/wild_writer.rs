@@ -89,11 +89,11 @@ impl<C: Channel> Scribble for Port<C> {
             self.last = Some((*message.envelope(), *message.header(), kept));
         }
         // A full queue, or a channel whose chunks are all in use, is no failure of this test.
-        let _sent = match random.below(3) {
-            0 => self.random(random).map(|()| written.random += 1),
-            1 => self.flipped(random).map(|()| written.flipped += 1),
-            _ => self.senseless(random).map(|()| written.senseless += 1),
-        };
+        match random.below(3) {
+            0 => written.random += u64::from(self.random(random).is_some()),
+            1 => written.flipped += u64::from(self.flipped(random).is_some()),
+            _ => written.senseless += u64::from(self.senseless(random).is_some()),
+        }
     }
 }
 
@@ -212,7 +212,8 @@ fn write_wildly(system: &System, stop: &AtomicBool) -> Written {
             port.scribble(&mut random, &mut written);
         }
         nonsense.send(&mut random);
-        std::thread::sleep(Duration::from_millis(1));
+        // Often enough that every turn of every service meets some; a flood would only show how fast the machine is.
+        std::thread::sleep(Duration::from_millis(5));
     }
     written
 }
@@ -249,6 +250,8 @@ fn a_wild_writer_on_every_channel_neither_kills_nor_misleads_anybody() {
     assert_eq!(keyframes(&folder), (0..6).collect::<Vec<u64>>(), "{metrics:#}");
     assert_eq!(mission["end_reason"], "complete", "{metrics:#}");
     assert_eq!(mission["collisions"], 0, "{metrics:#}");
+    let clearance_m = mission["min_clearance_m"].as_f64().expect("a clearance");
+    assert!(clearance_m > 0.7, "{clearance_m} m from the object");
     let restarts = mission["restarts"].as_object().expect("restarts by service");
     assert!(restarts.values().all(|count| count.as_u64() == Some(0)), "{restarts:?}");
     for entry in std::fs::read_dir(folder.join("logs")).expect("logs").flatten() {
