@@ -22,6 +22,8 @@ const LARGEST_STEP_M: f64 = 0.3;
 const FRESH_TICKS: u64 = 10;
 /// Gap between setpoints after which they are a new stream, ticks.
 const GAP_TICKS: u64 = 50;
+/// A jump of the estimate is told within this time, ticks: ODOMETRY comes 30 times a second.
+const TOLD_TICKS: u64 = 10;
 /// A pilot is noticed within this time, ticks: CURRENT_MODE comes with every change, heartbeats once a second.
 const NOTICED_TICKS: u64 = 150;
 
@@ -85,6 +87,8 @@ struct Model {
     may_move: bool,
     /// Where the vehicle was when px4-link began anew.
     anchor: Option<DVec3>,
+    /// The estimate jumped at this tick: setpoints are in the frame of before until the autopilot has told.
+    jumped_at: Option<u64>,
     /// The link was silent until this tick: what was streamed meanwhile was not seen.
     back_at: Option<u64>,
     /// A pilot commanded a mode at this tick, and nobody said go on since.
@@ -102,6 +106,7 @@ impl Model {
             next_target: 10,
             may_move: true,
             anchor: None,
+            jumped_at: None,
             back_at: None,
             pilot_since: None,
         }
@@ -134,12 +139,19 @@ impl Model {
                 let local_m = DVec3::new(f64::from(setpoint.y), f64::from(setpoint.x), f64::from(-setpoint.z));
                 let believed = self.rig.simulator.vehicle().estimate().position_m;
                 let believed_m = DVec3::new(believed.y, believed.x, -believed.z);
+                if self.jumped_at.is_some_and(|tick| self.tick <= tick + TOLD_TICKS) {
+                    self.last = None;
+                    return Ok(());
+                }
                 let fresh = self.last.filter(|(tick, _)| self.tick - tick <= GAP_TICKS);
                 // Within a stream from setpoint to setpoint, both relative to the vehicle: a jump of the origin moves both.
                 let relative_m = local_m - believed_m;
                 let truth_m = self.rig.simulator.truth().position_m;
                 let world_m = truth_m + relative_m;
-                let step_m = fresh.map_or(relative_m.length(), |(_, last_m)| world_m.distance(last_m));
+                // After a jump the stream goes on, and the vehicle is wherever it was on the way.
+                let goes_on = self.jumped_at.is_some_and(|tick| self.tick <= tick + GAP_TICKS);
+                let begins_m = if goes_on { 0.0 } else { relative_m.length() };
+                let step_m = fresh.map_or(begins_m, |(_, last_m)| world_m.distance(last_m));
                 prop_assert!(step_m <= LARGEST_STEP_M, "tick {}: a setpoint is {step_m:.2} m off", self.tick);
                 if fresh.is_none() {
                     self.anchor = Some(truth_m);
@@ -154,7 +166,8 @@ impl Model {
                 if command.command == MavCmd::MAV_CMD_DO_SET_MODE && command.param2 == 6.0 =>
             {
                 let age = self.last.map(|(tick, _)| self.tick - tick);
-                let unseen = self.back_at.is_some_and(|tick| self.tick <= tick + FRESH_TICKS);
+                let unseen = self.jumped_at.is_some_and(|tick| self.tick <= tick + TOLD_TICKS + FRESH_TICKS)
+                    || self.back_at.is_some_and(|tick| self.tick <= tick + FRESH_TICKS);
                 prop_assert!(
                     unseen || age.is_some_and(|age| age <= FRESH_TICKS),
                     "tick {}: OFFBOARD without a fresh stream (last setpoint {age:?} ticks ago)",
@@ -221,6 +234,7 @@ impl Model {
             }
             Chance::Jump([x, y, z]) => {
                 self.rig.simulator.vehicle_mut().reset_estimate(DVec3::new(x, y, z));
+                self.jumped_at = Some(self.tick);
                 self.ticks(100, true)?;
             }
             Chance::Station(mode) => {
