@@ -94,6 +94,8 @@ pub struct Core {
     running: Option<Running>,
     answered: VecDeque<(ReplyAddress, CommandReply)>,
     started_ns: Option<u64>,
+    /// When the link was stepped last.
+    stepped_ns: Option<u64>,
     alive_ns: u64,
     refused: Option<(u64, TargetStatus)>,
     report: Option<Report>,
@@ -141,6 +143,7 @@ impl Core {
             running: None,
             answered: VecDeque::new(),
             started_ns: None,
+            stepped_ns: None,
             alive_ns: 0,
             refused: None,
             report: None,
@@ -275,6 +278,8 @@ impl Core {
     /// One turn, after everything received was taken.
     pub fn step(&mut self, now_ns: u64) -> Outputs {
         self.started_ns.get_or_insert(now_ns);
+        // After a stall the stream is not what it was: the streamer finds that out, and says so in its next report.
+        let stalled = self.stepped_ns.replace(now_ns).is_some_and(|last_ns| now_ns.saturating_sub(last_ns) > QUIET_NS);
         self.beat(now_ns);
         if let Some(system) = self.system {
             if let Some(message) = self.asks.step(now_ns, system) {
@@ -295,7 +300,7 @@ impl Core {
             commander: self.commander,
         });
         self.hold_on_ground(now_ns);
-        if !self.deaf(now_ns) {
+        if !self.deaf(now_ns) && !stalled {
             self.mind_the_planner(now_ns);
             self.run_procedure(now_ns);
         }

@@ -224,6 +224,12 @@ impl Core {
             streaming: report.is_some_and(|report| report.streaming),
         };
         let Some(running) = &mut self.running else { return };
+        let enters = matches!(running.procedure.stage(), Some(Stage::Mode { mode: FlightMode::Offboard, .. }));
+        if enters && !view.streaming {
+            // It stopped since it was begun: a silence of the autopilot, or a stall. OFFBOARD without it would fly nothing.
+            self.fail(now_ns, "the stream of setpoints stopped before OFFBOARD was on");
+            return;
+        }
         let (wishes, outcome) = running.procedure.turn(&view);
         let commanded = running.procedure.commanded.take();
         if let Some(mode) = commanded {
