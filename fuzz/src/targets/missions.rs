@@ -233,13 +233,13 @@ pub fn way_back(data: &[u8]) {
         }
         let store = Store::new(folder.path());
         black_box(store.kept());
-        let waypoints = store.way_back().waypoints();
+        let limits = Limits::new(&shared_types::config::LinkConfig::default());
+        let waypoints = store.way_back(&limits).waypoints();
         let here = glam::DVec3::new(1.0, 2.0, 3.0);
         if let Some((rest, distance_m)) = rest_from(&waypoints, here)
             && distance_m <= 1.5
         {
             let start = Point { position_m: here, ..Point::default() };
-            let limits = Limits::new(&shared_types::config::LinkConfig::default());
             let path = FlightPath::new(start, &rest, &limits);
             let plan = px4_link::setpoint::plan(&path, &limits);
             assert!(plan.duration_s.is_finite() && path.end().is_finite(), "a way back of {} s", plan.duration_s);

@@ -28,6 +28,8 @@ const CELL_S: f64 = 0.05;
 const SLOWEST_SHARE: f64 = 0.05;
 /// A flight that is not over by then is not simulated further.
 const LONGEST_STEPS: usize = 24_000;
+/// No path may take longer at the limits, seconds: longer ones are refused before they are planned.
+pub const LONGEST_S: f64 = 1_200.0;
 
 /// A path, and how it is flown.
 #[derive(Debug, Clone, PartialEq)]
@@ -308,7 +310,7 @@ pub fn plan(path: &Path, limits: &Limits) -> Plan {
 
 /// Flies a path with one window, again and again, slower where it left the path by too much.
 fn slowed_at_corners(path: &Path, n1: usize, limits: &Limits) -> Plan {
-    let cells = Plan::cell(path.total_s()) + 1;
+    let cells = Plan::cell(path.total_s().min(LONGEST_S)) + 1;
     let mut plan = Plan { path: path.clone(), n1, shares: vec![1.0; cells], duration_s: 0.0, deviation_m: 0.0 };
     for _ in 0..14 {
         let slower = fly_beforehand(&mut plan, limits);

@@ -1,13 +1,15 @@
 //! What must outlive px4-link: the checked way back, and whose vehicle it was. Small files in the system folder, whole or
 //! absent.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 use shared_types::folder::write_atomic;
 use shared_types::messages::{FlightMode, Waypoint};
 
 use crate::frames::KeptTransform;
+use crate::path::{Limits, Path, Point};
+use crate::setpoint::LONGEST_S;
 
 /// The way home from the last target: its path, then the way back from its end.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
@@ -25,6 +27,15 @@ impl WayBack {
             .map(|w| [w.position_m[0], w.position_m[1], w.position_m[2], w.yaw_rad, w.gimbal_pitch_rad, w.speed_mps])
             .collect();
         Self { points }
+    }
+
+    /// Whether its whole path is one that can be planned: a file of this name may hold anything, and a path of years would
+    /// take all memory while the vehicle waits for it in the air.
+    #[must_use]
+    pub fn can_be_flown(&self, limits: &Limits) -> bool {
+        let waypoints = self.waypoints();
+        let start = waypoints.first().map(Point::of).unwrap_or_default();
+        waypoints.len() == self.points.len() && Path::new(start, &waypoints, limits).total_s() <= 2.0 * LONGEST_S
     }
 
     /// As waypoints; those with numbers that are not finite are left out.
@@ -98,7 +109,7 @@ pub struct Store {
 impl Store {
     /// Files in this folder.
     #[must_use]
-    pub fn new(folder: &Path) -> Self {
+    pub fn new(folder: &std::path::Path) -> Self {
         Self { folder: folder.to_owned() }
     }
 
@@ -121,10 +132,16 @@ impl Store {
         }
     }
 
-    /// The last way back; empty when there is none.
+    /// The last way back; empty when there is none, or none that can be flown.
     #[must_use]
-    pub fn way_back(&self) -> WayBack {
-        self.read("px4-link-return.json")
+    pub fn way_back(&self, limits: &Limits) -> WayBack {
+        let way: WayBack = self.read("px4-link-return.json");
+        if !way.can_be_flown(limits) {
+            let path = self.folder.join("px4-link-return.json");
+            tracing::warn!(path = %path.display(), points = way.points.len(), "left out: no path that can be flown");
+            return WayBack::default();
+        }
+        way
     }
 
     /// Keeps a way back.
@@ -156,7 +173,14 @@ mod tests {
         let kept = Kept { ours: true, last_target_id: 9, ..Kept::default() };
         store.keep(&kept);
         store.keep_way_back(&WayBack { points: vec![[1.0, 2.0, 3.0, 0.0, -0.5, 1.0]] });
-        assert_eq!((store.kept(), store.way_back().waypoints().len()), (kept, 1));
+        let limits = Limits::new(&shared_types::config::LinkConfig::default());
+        assert_eq!((store.kept(), store.way_back(&limits).waypoints().len()), (kept, 1));
+        // A flight of centuries, and numbers that JSON has and f64 has not.
+        store.keep_way_back(&WayBack { points: vec![[0.0; 6], [1e12, 0.0, 0.0, 0.0, 0.0, 1.0]] });
+        assert_eq!(store.way_back(&limits), WayBack::default());
+        std::fs::write(folder.path().join("px4-link-return.json"), b"{\"points\":[[1e999,0,0,0,0,1]]}")
+            .expect("written");
+        assert_eq!(store.way_back(&limits), WayBack::default());
         std::fs::write(folder.path().join("px4-link.json"), b"{\"ours\":tr").expect("written");
         assert_eq!(store.kept(), Kept::default());
         std::fs::write(folder.path().join("px4-link.json"), b"{\"last_target_id\":3}").expect("written");
@@ -182,7 +206,7 @@ mod tests {
         let after = folder.path().join("after");
         let findings = every_outcome(&recorder.trace(), &after, |root| {
             let store = Store::new(root);
-            match (store.kept(), store.way_back()) {
+            match (store.kept(), store.way_back(&Limits::new(&shared_types::config::LinkConfig::default()))) {
                 (a, b) if a == kept(1) && b == way(1.0) => Ok("old"),
                 (a, b) if a == kept(2) && b == way(1.0) => Ok("between"),
                 (a, b) if a == kept(2) && b == way(2.0) => Ok("new"),

@@ -72,6 +72,8 @@ pub struct FreeSpace {
 }
 
 /// Samples of a checked segment are at most so far apart where it is tight, metres.
+/// Longer legs are not looked at, and not flown: a journal or a state with wild coordinates would be looked at for ever.
+const LONGEST_LEG_M: f64 = 2_000.0;
 const STEP_M: f64 = 0.01;
 /// The clearance asked for grows from that of a path's ends by this much a metre, up to clearance + margin.
 const GROWTH: f64 = 0.5;
@@ -134,6 +136,10 @@ impl FreeSpace {
         let wanted = self.clearance_m + self.margin_m;
         let held = ends.map(|end| self.box_distance(end).min(wanted));
         let length = (to_m - from_m).length();
+        // Not a number is not shorter.
+        if length.is_nan() || length > LONGEST_LEG_M {
+            return false;
+        }
         let direction = (to_m - from_m).normalize_or_zero();
         let floor = |point: DVec3| {
             ends.iter().any(|end| end.z < self.floor_z_m && (point - *end).length() < 1e-6)

@@ -115,9 +115,10 @@ impl Core {
     #[must_use]
     pub fn new(config: &LinkConfig, lockstep: bool, incarnation: u64, store: Store) -> Self {
         let kept = store.kept();
-        let way_back = store.way_back();
+        let limits = Limits::new(config);
+        let way_back = store.way_back(&limits);
         Self {
-            limits: Limits::new(config),
+            limits,
             config: config.clone(),
             incarnation,
             world: WorldTransform::new(kept.transform),

@@ -14,7 +14,7 @@ use super::{ANSWERS_KEPT, Core, MOST_WAYPOINTS, Running, START_TOLERANCE_M, comm
 use crate::commands::{Outcome, Procedure, Stage, View, Wish};
 use crate::params;
 use crate::path::{Path, Point, rest_from};
-use crate::setpoint::plan;
+use crate::setpoint::{LONGEST_S, plan};
 use crate::state::Phase;
 use crate::store::WayBack;
 use crate::stream::{Order, Report};
@@ -67,10 +67,15 @@ impl Core {
             self.refused = Some((header.id, TargetStatus::RefusedStart));
             return;
         }
+        let path = Path::new(report.input, path, &self.limits);
+        if path.total_s() > LONGEST_S || !WayBack::of(waypoints).can_be_flown(&self.limits) {
+            self.refused = Some((header.id, TargetStatus::RefusedPath));
+            return;
+        }
         self.refused = None;
         self.way_back = WayBack::of(waypoints);
         self.store.keep_way_back(&self.way_back);
-        let plan = Box::new(plan(&Path::new(report.input, path, &self.limits), &self.limits));
+        let plan = Box::new(plan(&path, &self.limits));
         tracing::info!(id = header.id, duration_s = plan.duration_s, "flying a target");
         self.out.orders.push(Order::Fly { id: header.id, plan, needs_planner: true });
         if let Some(report) = &mut self.report {

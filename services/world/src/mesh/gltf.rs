@@ -6,6 +6,8 @@ use std::path::Path;
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD as BASE64;
 use glam::{Mat3, Mat4, Vec2, Vec3};
+use gltf::Accessor;
+use gltf::accessor::{DataType, Dimensions};
 use gltf::mesh::Mode;
 
 use super::{Material, MeshError, RawMesh, images};
@@ -25,7 +27,8 @@ pub(super) fn read(path: &Path, bytes: &[u8]) -> Result<RawMesh, MeshError> {
     const VALID: &str = "a valid glTF 2.0 file without compression extensions";
     let gltf::Gltf { document, blob } =
         gltf::Gltf::from_slice_without_validation(bytes).map_err(|error| malformed(error.to_string(), VALID))?;
-    let json = document.into_json();
+    let mut json = document.into_json();
+    complete_images(&mut json);
     check_positions(&json).map_err(|found| malformed(found, VALID))?;
     let document = gltf::Document::from_json(json).map_err(|error| malformed(error.to_string(), VALID))?;
     let mut buffers = Vec::new();
@@ -67,6 +70,21 @@ fn check_positions(json: &gltf::json::Root) -> Result<(), String> {
     match used.map(|index| index.value()).find(|&index| index >= json.accessors.len()) {
         Some(index) => Err(format!("positions in accessor {index} of {}", json.accessors.len())),
         None => Ok(()),
+    }
+}
+
+/// The library takes for granted that an image says where it lies and, in a buffer, of what kind it is. The kind is told
+/// from the bytes anyway, and an image that lies nowhere is one that cannot be read.
+fn complete_images(json: &mut gltf::json::Root) {
+    for image in &mut json.images {
+        match image.buffer_view {
+            Some(_) => {
+                image.mime_type.get_or_insert_with(|| gltf::json::image::MimeType("image/png".to_owned()));
+            }
+            None => {
+                image.uri.get_or_insert_default();
+            }
+        }
     }
 }
 
@@ -129,10 +147,35 @@ struct Parts {
     unvisited: Vec<bool>,
 }
 
-/// What an accessor reads must lie in a buffer: one without a view is as many zeros as it likes.
-fn backed(accessor: Option<gltf::Accessor>) -> Result<(), String> {
-    let bare = accessor.filter(|accessor| accessor.view().is_none());
-    bare.map_or(Ok(()), |accessor| Err(format!("accessor {} has no buffer view", accessor.index())))
+/// What an accessor may hold: its shape, and the types of its numbers.
+type Kinds = (Dimensions, &'static [DataType]);
+const VECTORS: Kinds = (Dimensions::Vec3, &[DataType::F32]);
+const INDICES: Kinds = (Dimensions::Scalar, &[DataType::U8, DataType::U16, DataType::U32]);
+const COORDINATES: Kinds = (Dimensions::Vec2, &[DataType::F32, DataType::U8, DataType::U16]);
+
+/// Whether an accessor holds what it should, and lies in its buffer with everything that it counts. The library's readers
+/// take that for granted; an accessor without a view would be as many zeros as it likes.
+fn check_accessor(accessor: Option<Accessor>, (shape, types): Kinds, buffers: &[Vec<u8>]) -> Result<(), String> {
+    let Some(accessor) = accessor else { return Ok(()) };
+    let fault = |what: &str| Err(format!("accessor {} {what}", accessor.index()));
+    if accessor.dimensions() != shape || !types.contains(&accessor.data_type()) {
+        let found = format!("holds {:?} of {:?}", accessor.dimensions(), accessor.data_type());
+        return fault(&format!("{found} where {shape:?} of {types:?} belong"));
+    }
+    if accessor.sparse().is_some() {
+        return fault("is sparse, which is not read: export the mesh without sparse accessors");
+    }
+    let Some(view) = accessor.view() else { return fault("has no buffer view") };
+    let (size, count) = (accessor.size(), accessor.count());
+    let stride = view.stride().unwrap_or(size);
+    let bytes = count.checked_sub(1).and_then(|gaps| gaps.checked_mul(stride)?.checked_add(size));
+    let inside = bytes.and_then(|bytes| bytes.checked_add(accessor.offset())).is_some_and(|end| end <= view.length());
+    let end = view.offset().checked_add(view.length());
+    let backed = buffers.get(view.buffer().index()).is_some_and(|buffer| end.is_some_and(|end| end <= buffer.len()));
+    if stride < size || !inside || !backed {
+        return fault(&format!("of {count} items, {stride} bytes apart, does not lie in its buffer"));
+    }
+    Ok(())
 }
 
 impl Parts {
@@ -169,9 +212,9 @@ impl Parts {
             return Ok(());
         }
         for semantic in [gltf::Semantic::Positions, gltf::Semantic::Normals] {
-            backed(primitive.get(&semantic))?;
+            check_accessor(primitive.get(&semantic), VECTORS, buffers)?;
         }
-        backed(primitive.indices())?;
+        check_accessor(primitive.indices(), INDICES, buffers)?;
         let reader = primitive.reader(|buffer| buffers.get(buffer.index()).map(Vec::as_slice));
         let positions: Vec<Vec3> =
             reader.read_positions().ok_or("positions outside their buffer")?.map(Vec3::from_array).collect();
@@ -181,7 +224,7 @@ impl Parts {
         };
         let normals: Option<Vec<Vec3>> = reader.read_normals().map(|normals| normals.map(Vec3::from_array).collect());
         let set = primitive.material().pbr_metallic_roughness().base_color_texture().map_or(0, |info| info.tex_coord());
-        backed(primitive.get(&gltf::Semantic::TexCoords(set)))?;
+        check_accessor(primitive.get(&gltf::Semantic::TexCoords(set)), COORDINATES, buffers)?;
         let uvs: Option<Vec<Vec2>> =
             reader.read_tex_coords(set).map(|uvs| uvs.into_f32().map(Vec2::from_array).collect());
 
