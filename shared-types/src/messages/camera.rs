@@ -129,7 +129,8 @@ impl<'a> FrameView<'a> {
             && header.world_from_camera_position_m.iter().all(|v| v.is_finite())
             && header.world_from_camera_xyzw.iter().all(|v| v.is_finite())
             && header.world_from_camera_xyzw.iter().map(|v| v * v).sum::<f64>() > 0.5
-            && header.focal_px.iter().chain(&header.principal_px).all(|v| v.is_finite() && *v > 0.0);
+            && header.focal_px.iter().all(|v| v.is_finite() && *v > 0.0)
+            && header.principal_px.iter().all(|v| v.is_finite());
         if !sane || items.len() != header.items_len() {
             return None;
         }

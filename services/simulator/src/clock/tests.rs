@@ -137,13 +137,15 @@ fn leaving_is_no_out() {
     clock.on_grant(&grant(LINK, 1), 0, MS);
     clock.on_grant(&Grant { leaving: true, ..grant(PLANNER, 1) }, 0, MS);
     clock.on_gone(PLANNER, 100);
-    assert_eq!(clock.poll(0, MS), Phase::Ready);
-    clock.advance(MS);
-    clock.on_grant(&grant(LINK, 2), 0, MS);
-    assert_eq!(clock.poll(0, MS), Phase::Ready, "not limited to real time");
-    clock.advance(MS);
-    clock.on_grant(&Grant { leaving: true, ..grant(LINK, 3) }, 0, 2 * MS);
-    assert_eq!(clock.poll(0, 2 * MS), Phase::Until(11 * MS), "with nobody left there is no hurry");
+    assert_eq!(clock.poll(0, MS), Phase::Until(10 * MS), "it may be started again at once");
+    let later = 2002 * MS;
+    assert_eq!(clock.poll(0, later), Phase::Ready, "not limited to real time any more");
+    clock.advance(later);
+    clock.on_grant(&grant(LINK, 2), 0, later);
+    assert_eq!(clock.poll(0, later), Phase::Ready);
+    clock.advance(later);
+    clock.on_grant(&Grant { leaving: true, ..grant(LINK, 3) }, 0, later + MS);
+    assert_eq!(clock.poll(0, later + MS), Phase::Until(later + 10 * MS), "with nobody left there is no hurry");
     assert!(clock.deterministic());
 }
 
