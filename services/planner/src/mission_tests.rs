@@ -293,48 +293,4 @@ proptest::proptest! {
         }).collect();
         proptest::prop_assert_eq!(ids.len(), 14 + 2);
     }
-
-    /// Whatever operator, pilot, battery, camera and deaths do: the vehicle comes down, and what exists exists once.
-    #[test]
-    fn there_is_always_a_way_to_the_ground(
-        told in proptest::collection::btree_map(
-            1u64..12_000,
-            proptest::sample::select(vec![
-                MissionCommand::Start, MissionCommand::Stop, MissionCommand::Land, MissionCommand::Abort,
-                MissionCommand::GoOn, MissionCommand::Recall,
-            ]),
-            0..6,
-        ),
-        deaths in proptest::collection::btree_map(50u64..13_000, 1u64..400, 0..3),
-        link in proptest::collection::btree_set(1500u64..13_000, 0..2),
-        pilot in proptest::option::of(1500u64..12_000),
-        drain_per_s in proptest::sample::select(vec![0.0, 0.004, 0.01]),
-        failing_capture in 0u64..4,
-    ) {
-        let mut commands = told;
-        // An operator does not leave a vehicle that holds: in the end he lets it go on, and then calls it home.
-        commands.extend([(40_000, MissionCommand::GoOn), (41_000, MissionCommand::Stop)]);
-        let faults = Faults {
-            restarts: deaths,
-            link_restarts: link,
-            commands,
-            pilot,
-            drain_per_s,
-            failing_capture,
-            ..Faults::default()
-        };
-        let (world, _) = fly(short(), faults);
-        proptest::prop_assert_eq!((world.vehicle.landed, world.vehicle.armed), (1, 0));
-        proptest::prop_assert!(world.captures.values().all(|&count| count == 1));
-        proptest::prop_assert!(world.keyframes() <= 14);
-        proptest::prop_assert!(world.least_clearance_m >= 0.72, "{}", world.least_clearance_m);
-        let mut ids: Vec<u64> = world.journal.iter().filter_map(|entry| match &entry.record {
-            Record::Captured { keyframe_id, .. } => Some(*keyframe_id),
-            _ => None,
-        }).collect();
-        let all = ids.len();
-        ids.sort_unstable();
-        ids.dedup();
-        proptest::prop_assert_eq!(ids.len(), all, "a keyframe twice in the journal");
-    }
 }
