@@ -119,30 +119,19 @@ fn a_service_that_is_asked_to_end_is_started_again() {
     assert_complete(&folder);
 }
 
+/// Those that fly: the vehicle is brought home first, and then the mission goes on.
 #[test]
-fn a_link_that_is_asked_to_end_in_the_air_lands_first_and_the_mission_goes_on() {
-    let base = tempfile::tempdir().expect("folder");
-    let folder = base.path().join("mission");
-    let mut flight = start(&folder, &[]);
-    flight.wait_until("the keyframes", |flight| keyframes(&flight.folder).len() >= 2);
-    kill(flight.services()["px4-link"], "TERM");
-    flight.finish_well();
-    assert_complete(&folder);
-}
-
-#[test]
-fn a_planner_that_is_asked_to_end_in_the_air_lands_first_and_leaves_the_mission_open() {
-    let base = tempfile::tempdir().expect("folder");
-    let folder = base.path().join("mission");
-    let mut flight = start(&folder, &[]);
-    flight.wait_until("the keyframes", |flight| keyframes(&flight.folder).len() >= 2);
-    kill(flight.services()["planner"], "TERM");
-    assert_eq!(flight.finish().code(), Some(1));
-    assert!(journal(&folder).iter().all(|entry| entry["event"] != "over"), "the mission is open");
-    let mut resume = vantage();
-    resume.arg("resume").arg(&folder);
-    Flight::spawn(&folder, resume).finish_well();
-    assert_complete(&folder);
+fn who_flies_and_is_asked_to_end_lands_first_and_the_mission_goes_on() {
+    for service in ["px4-link", "planner"] {
+        let base = tempfile::tempdir().expect("folder");
+        let folder = base.path().join("mission");
+        let mut flight = start(&folder, &[]);
+        flight.wait_until("the keyframes", |flight| keyframes(&flight.folder).len() >= 2);
+        kill(flight.services()[service], "TERM");
+        flight.finish_well();
+        assert_complete(&folder);
+        assert_eq!(metrics(&folder)["mission"]["restarts"][service], 1, "{service}");
+    }
 }
 
 #[test]

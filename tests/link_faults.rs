@@ -166,10 +166,9 @@ fn a_fence_that_is_drawn_around_a_vehicle_outside_of_it() {
 fn a_pilot_takes_over_and_gives_back() {
     let base = tempfile::tempdir().expect("folder");
     let folder = base.path().join("mission");
-    let faults = ["--set", "simulator.faults=[\"pilot at 36 for 4\"]"];
-    let mut arguments = vec!["--preset", "tiny", "--seed", "21"];
-    arguments.extend(faults);
-    let mut flight = Flight::start(&folder, &arguments);
+    // An operator's word takes real time, and a battery lasts for mission time: not as fast as it goes.
+    let faults = ["--speed", "5", "--set", "simulator.faults=[\"pilot at 36 for 4\"]"];
+    let mut flight = Flight::start(&folder, &[&["--preset", "tiny", "--seed", "21"], &faults[..]].concat());
     let suspended = |folder: &PathBuf| journal(folder).iter().any(|entry| entry["event"] == "suspended");
     flight.wait_until("the pilot", |flight| suspended(&flight.folder));
     let system = system_of(flight.pid());

@@ -56,6 +56,8 @@ pub struct Watch {
 impl Watch {
     /// Listens to the system that process `launch` supervises, once there is one.
     pub fn begin(launch: u32) -> Self {
+        // What is listened to may vanish at any moment; the bus would print every file of it.
+        shared_types::logging::init(shared_types::logging::LevelFilter::OFF);
         let (heard, stop) = (Arc::new(Mutex::new(Heard::default())), Arc::new(AtomicBool::new(false)));
         let (notes, end) = (Arc::clone(&heard), Arc::clone(&stop));
         let thread = std::thread::spawn(move || {

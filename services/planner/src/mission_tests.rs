@@ -207,6 +207,20 @@ fn a_recalled_mission_lands_and_goes_on_when_it_is_resumed() {
 }
 
 #[test]
+fn a_planner_whose_process_is_to_end_lands_and_the_next_one_goes_on() {
+    for at in [700, 3000, 6000] {
+        let mut world = World::new(setup(short(), 7), rock(), Faults::default());
+        world.step_down_at(at);
+        assert_eq!(world.fly(2000.0), EndReason::None, "at {at}");
+        // Whoever supervises it is not told that the mission is over: it would end everything.
+        assert_eq!(world.state.unwrap().phase, MissionPhase::Landing.code(), "at {at}");
+        world.resume();
+        assert_eq!((world.fly(2000.0), world.keyframes()), (EndReason::Complete, 14), "at {at}");
+        assert!(world.captures.values().all(|&count| count == 1));
+    }
+}
+
+#[test]
 fn a_held_mission_can_be_recalled_and_a_recalled_one_stopped() {
     let commands = BTreeMap::from([(6000, MissionCommand::Abort), (7000, MissionCommand::Recall)]);
     let (mut world, end) = fly(short(), Faults { commands, ..Faults::default() });

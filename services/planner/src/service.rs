@@ -98,7 +98,7 @@ impl Planner {
         if self.stopping {
             // Not the operator's stop: he may only want this process away, and the mission goes on after that.
             self.stopping = false;
-            inputs.commands.push((usize::MAX, MissionCommand::Recall));
+            self.mission.step_down();
         }
         let outputs = self.mission.step(now_ns, inputs, &mut self.views);
         self.decided += 1;

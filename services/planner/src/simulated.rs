@@ -167,6 +167,14 @@ impl World {
         panic!("not over after {limit_s} s: {:?}, last {:?}", mission.state(), self.journal.last());
     }
 
+    /// The planner's process is asked to end at this tick.
+    pub fn step_down_at(&mut self, tick: u64) {
+        while self.tick < tick {
+            self.step();
+        }
+        self.mission.as_mut().unwrap().step_down();
+    }
+
     /// Another planner for the same folder: its journal is all that it knows.
     pub fn resume(&mut self) {
         self.mission = Some(Mission::new(self.setup.clone(), &self.journal));

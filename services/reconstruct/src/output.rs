@@ -3,7 +3,7 @@
 use std::fs::{self, File, TryLockError};
 use std::path::{Component, Path, PathBuf};
 
-use shared_types::folder::{create_dir_durable, write_atomic};
+use shared_types::folder::{FolderError, create_dir_durable, write_atomic};
 use shared_types::storage;
 
 use crate::checkpoint::{self, State};
@@ -41,7 +41,10 @@ impl Output {
             let path = path.to_owned();
             |source| ReconstructError::Output { path, source }
         };
-        create_dir_durable(root)?;
+        create_dir_durable(root).map_err(|error| match error {
+            FolderError::Io { .. } => refused(root)(std::io::Error::other(error)),
+            error => error.into(),
+        })?;
         let path = root.join(LOCK);
         if !path.exists() {
             // It tells that what lies beside it is ours: on the disk before all of that.

@@ -103,7 +103,11 @@ mod tests {
     #[test]
     fn a_hung_process_is_reported_on_and_killed() {
         let (mut child, report) = examined(true);
-        assert!(report.starts_with("trainer, pid ") && report.contains("sleep, S (sleeping)"), "{report}");
+        // Its state may be any: on a busy disk it is still being loaded.
+        assert!(
+            report.starts_with("trainer, pid ") && report.contains(&format!("\n{}, sleep, ", child.id())),
+            "{report}"
+        );
         assert_eq!(child.wait().expect("ended").signal(), Some(9));
     }
 

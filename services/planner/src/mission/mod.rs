@@ -97,6 +97,8 @@ pub struct Mission {
     trainer_failed: bool,
     /// Told to come home and to leave the mission open. In no journal: `resume` goes on as if it had not been said.
     recalled: bool,
+    /// Recalled because the process that runs it is to end: the next one goes on, so nobody is told that it is over.
+    stepping_down: bool,
     /// Told to end before it began.
     cancelled: bool,
     published: Option<(MissionState, u64)>,
@@ -148,6 +150,7 @@ impl Mission {
             score_sent: None,
             trainer_failed: false,
             recalled: false,
+            stepping_down: false,
             cancelled: false,
             published: None,
             sequence: 0,
@@ -325,6 +328,15 @@ impl Mission {
                 Ok(())
             }
             MissionCommand::GoOn => Err("the mission is not suspended".to_owned()),
+        }
+    }
+
+    /// The process is to end with the vehicle in the air: comes home and leaves the mission open, for a next process that goes
+    /// on with it at once. Told otherwise before, it does that.
+    pub fn step_down(&mut self) {
+        if self.ledger.started_ns.is_some() && self.ledger.over.is_none() && !self.homeward() {
+            self.stepping_down = true;
+            self.recall();
         }
     }
 

@@ -61,7 +61,12 @@ impl Mission {
             started_ns: ledger.started_ns.unwrap_or(0),
             mission_id: pack_text(&self.setup.mission_id),
             folder: pack_text(&self.setup.folder),
-            phase: self.state.phase(self.waiting(), usable).code(),
+            phase: if self.stepping_down && self.is_over() && ledger.over.is_none() {
+                // The mission goes on with the next process.
+                MissionPhase::Landing.code()
+            } else {
+                self.state.phase(self.waiting(), usable).code()
+            },
             end_reason: reason.code(),
             round: count(ledger.rounds.len()),
             keyframes: count(ledger.taken.len()),
