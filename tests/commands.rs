@@ -140,3 +140,24 @@ fn every_command_has_help_with_an_example_and_the_configuration_is_printed_whole
     let (status, again) = run(&["config", "--config", text(&file)]);
     assert_eq!((status, again), (Some(0), printed), "a printed configuration reads back as itself");
 }
+
+#[test]
+fn a_machine_that_lets_too_few_files_be_open_is_refused_with_both_numbers() {
+    let base = tempfile::tempdir().expect("folder");
+    let folder = base.path().join("mission");
+    let flown = |limit: &str| {
+        let vantage = vantage();
+        let mut shell = std::process::Command::new("sh");
+        shell.args(["-c", &format!("ulimit {limit} && exec \"$0\" fly --preset tiny --output \"$1\"")]);
+        shell.arg(vantage.get_program()).arg(&folder);
+        shell
+    };
+    let output = flown("-n 300").output().expect("runs");
+    let told = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert_eq!(output.status.code(), Some(69), "{told}");
+    assert!(told.contains("may open 300 files, expected at least 512: `ulimit -n 1024`"), "{told}");
+    assert!(!folder.exists(), "nothing was made");
+    // A soft limit is raised.
+    let output = flown("-Sn 300").output().expect("runs");
+    assert_eq!(output.status.code(), Some(0), "{}", String::from_utf8_lossy(&output.stderr));
+}

@@ -86,6 +86,19 @@ impl Flight {
         assert!(status.success(), "{status}\n{}", tell(&log, &folder));
     }
 
+    /// Launch is killed; waits until its services have ended without it, with the vehicle on the ground.
+    pub fn lose_launch(self) {
+        let services = self.services();
+        kill(self.pid(), "KILL");
+        self.finish();
+        let began = Instant::now();
+        while services.values().any(|pid| runs(*pid)) {
+            let left: Vec<_> = services.iter().filter(|(_, pid)| runs(**pid)).collect();
+            assert!(began.elapsed() < Duration::from_secs(60), "still there: {left:?}");
+            std::thread::sleep(Duration::from_millis(20));
+        }
+    }
+
     /// What the terminal showed, and the end of the services' logs.
     pub fn terminal(&self) -> String {
         tell(&self.log, &self.folder)

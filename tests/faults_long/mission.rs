@@ -16,7 +16,7 @@ const SERVICES: [&str; 8] = ["px4-link", "camera", "trainer", "scorer", "planner
 /// Longest wait for a new process, and for the services to end after launch.
 const PATIENCE: Duration = Duration::from_secs(60);
 /// Longest wait for a phase.
-const PHASE_PATIENCE: Duration = Duration::from_secs(5);
+const PHASE_PATIENCE: Duration = Duration::from_millis(1500);
 /// How long px4-link is waited for to fly by setpoints again; in many phases it need not.
 const OFFBOARD_PATIENCE: Duration = Duration::from_secs(3);
 /// Seed of the missions, or of the first.
@@ -26,8 +26,9 @@ const SEED: u64 = 21;
 struct Flying<'a> {
     options: &'a Options,
     index: u64,
+    seed: u64,
     folder: &'a Path,
-    /// `None` once launch was killed for good.
+    /// `None` while launch is dead.
     flight: Option<(Flight, Watch)>,
     faults: Vec<Fault>,
     largest_step_m: f64,
@@ -42,14 +43,12 @@ pub fn fly(options: &Options, index: u64) -> Flown {
     let began = Instant::now();
     let mut random = Random::new(options.seed ^ index.wrapping_mul(0x9e37_79b9));
     let seed = if options.vary_seed { SEED + index } else { SEED };
-    let text = seed.to_string();
-    let mut arguments = vec!["--preset", &options.preset, "--seed", &text, "--set", "launch.crash_limit=1000"];
-    arguments.extend(options.sets.iter().flat_map(|set| ["--set", set]));
-    let flight = Flight::start(&folder, &arguments);
+    let flight = start(options, &folder, seed);
     let watch = Watch::begin(flight.pid());
     let mut flying = Flying {
         options,
         index,
+        seed,
         folder: &folder,
         flight: Some((flight, watch)),
         faults: Vec::new(),
@@ -62,12 +61,19 @@ pub fn fly(options: &Options, index: u64) -> Flown {
         }
         flying.strike(&mut random);
     }
-    let mission = flying.end(seed, began, &before);
+    let mission = flying.end(began, &before);
     if mission.is_well() {
         drop(std::fs::remove_dir_all(&folder));
         drop(std::fs::remove_file(folder.with_extension("terminal.log")));
     }
     Flown { faults: flying.faults, mission }
+}
+
+fn start(options: &Options, folder: &Path, seed: u64) -> Flight {
+    let text = seed.to_string();
+    let mut arguments = vec!["--preset", &options.preset, "--seed", &text, "--set", "launch.crash_limit=1000"];
+    arguments.extend(options.sets.iter().flat_map(|set| ["--set", set]));
+    Flight::start(folder, &arguments)
 }
 
 impl Flying<'_> {
@@ -158,13 +164,15 @@ impl Flying<'_> {
             "services outlive launch by a minute".clone_into(&mut self.error);
         }
         // Killed before there was a mission: a user would look, and fly.
-        if self.folder.join("mission.toml").exists() {
+        let flight = if self.folder.join("mission.toml").exists() {
             let mut resume = vantage();
             resume.arg("resume").arg(self.folder);
-            let flight = Flight::spawn(self.folder, resume);
-            let watch = Watch::begin(flight.pid());
-            self.flight = Some((flight, watch));
-        }
+            Flight::spawn(self.folder, resume)
+        } else {
+            start(self.options, self.folder, self.seed)
+        };
+        let watch = Watch::begin(flight.pid());
+        self.flight = Some((flight, watch));
     }
 
     fn take_notes(&mut self) {
@@ -173,7 +181,7 @@ impl Flying<'_> {
         }
     }
 
-    fn end(&mut self, seed: u64, began: Instant, before: &[std::path::PathBuf]) -> Mission {
+    fn end(&mut self, began: Instant, before: &[std::path::PathBuf]) -> Mission {
         if let Some((flight, watch)) = self.flight.take() {
             let terminal = self.folder.with_extension("terminal.log");
             let status = flight.finish();
@@ -185,7 +193,7 @@ impl Flying<'_> {
         }
         let mut mission = Mission {
             mission: self.index,
-            seed,
+            seed: self.seed,
             end_reason: String::new(),
             lost: 0,
             doubled: 0,

@@ -26,7 +26,7 @@ pub fn of(folder: &Path) -> &'static str {
     let word = |key: &str| last[key].as_str().unwrap_or_default();
     match word("event") {
         "target" => match word("purpose") {
-            "prior-overhead" | "prior-side" | "scan" => "prior",
+            "prior-overhead" | "prior-side" | "check-overhead" | "check-side" | "scan" => "prior",
             "seed" => "seed orbit",
             "home" => "return",
             _ => "transit",

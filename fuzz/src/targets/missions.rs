@@ -39,6 +39,7 @@ pub fn journal(data: &[u8]) {
         mission_id: "m".to_owned(),
         folder: "/m".to_owned(),
         seed: 1,
+        epoch_ns: 0,
     };
     let mut mission = Mission::new(setup, &entries);
     for turn in 0..3 {

@@ -24,7 +24,10 @@ pub enum Command {
     #[command(after_help = "Example: vantage fly --object statue.obj --preset quick --output statue --seed 7")]
     Fly(Fly),
     /// Go on with a mission that was cut off.
-    #[command(after_help = "Example: vantage resume missions/20260801-120000-0")]
+    #[command(
+        after_help = "Example: vantage resume missions/20260801-120000-0\n         \
+        vantage resume missions/20260801-120000-0 --set trainer.backend=cpu"
+    )]
     Resume(Resume),
     /// Show what runs, since when, restarts, memory and ages of the last messages.
     #[command(after_help = "Example: vantage status --json")]
@@ -156,6 +159,10 @@ pub struct Resume {
     /// Simulated seconds per wall second at most; 0: no limit.
     #[arg(long, value_name = "X", allow_negative_numbers = true)]
     pub speed: Option<f64>,
+    /// One key of this flight, laid over mission.toml; not of [mission], [planner], [camera] and [world], which the journal
+    /// and the keyframes were made with. May be given many times.
+    #[arg(long = "set", value_name = "SECTION.KEY=VALUE")]
+    pub sets: Vec<String>,
     /// Print the result as JSON (report/metrics.json) instead of a table.
     #[arg(long)]
     pub json: bool,

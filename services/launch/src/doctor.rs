@@ -10,7 +10,7 @@ use splatting::gpu::{self, AdapterReport};
 
 use crate::cli::Doctor;
 use crate::exit::Exit;
-use crate::machine_check::{shared_memory_need_bytes, space_bytes};
+use crate::machine_check::{DESCRIPTORS, raised_descriptors, shared_memory_need_bytes, space_bytes};
 use crate::{instance, print, settings};
 
 /// How a check came out.
@@ -244,11 +244,16 @@ fn processor() -> Finding {
 }
 
 fn open_files() -> Finding {
-    let limit = rustix::process::getrlimit(rustix::process::Resource::Nofile).current.unwrap_or(u64::MAX);
-    if limit >= 512 {
+    let limit = raised_descriptors();
+    if limit >= DESCRIPTORS {
         Finding::new("open files", Verdict::Ok, format!("limit {limit}"), "")
     } else {
-        Finding::new("open files", Verdict::Problem, format!("limit {limit}, expected at least 512"), "ulimit -n 1024")
+        Finding::new(
+            "open files",
+            Verdict::Problem,
+            format!("limit {limit}, expected at least {DESCRIPTORS}"),
+            "ulimit -n 1024",
+        )
     }
 }
 

@@ -7,6 +7,7 @@ use anyhow::Context as _;
 use rustix::fs::{FlockOperation, flock};
 use shared_types::config::{Config, Layer, LinkConfig, load, load_mission};
 use shared_types::folder::{MissionFolder, write_atomic};
+use shared_types::messages::EndReason;
 use shared_types::system::{Hold, System};
 use world::SceneConfig;
 use world::mesh::{Mesh, Placement};
@@ -15,7 +16,7 @@ use crate::cli::{Fly, Resume};
 use crate::clock::date_stamp;
 use crate::exit::{Exit, Refusal};
 use crate::instance::{self, Claim};
-use crate::machine_check::{check_disk, check_shared_memory};
+use crate::machine_check::check_machine;
 use crate::progress::Progress;
 use crate::supervise::children::Starter;
 use crate::supervise::{self, Flight, Outcome};
@@ -31,8 +32,7 @@ pub fn fly(arguments: &Fly) -> anyhow::Result<Exit> {
     // The ports are this run's and not the mission's: the folder keeps what was asked for, so that `resume` may have others.
     let text = load::to_toml(&config)?;
     let claim = claim_instance(&mut config)?;
-    check_shared_memory(&config)?;
-    check_disk(Path::new(&config.mission.folder), &config)?;
+    check_machine(Path::new(&config.mission.folder), &config)?;
     let folder = MissionFolder::create_with(&config.mission.folder, &text)?;
     let name = arguments.system.clone().unwrap_or_else(|| format!("fly-{}", std::process::id()));
     mission(&folder, &config, &name, arguments.json, claim)
@@ -45,6 +45,9 @@ pub fn fly(arguments: &Fly) -> anyhow::Result<Exit> {
 pub fn resume(arguments: &Resume) -> anyhow::Result<Exit> {
     let folder = MissionFolder::open(&arguments.folder)?;
     let mut config = load_mission(&folder.config_path())?;
+    if !arguments.sets.is_empty() {
+        config = load(&settings::relaid(&folder.config_path(), &arguments.sets)?)?;
+    }
     config.mission.folder = utf8(folder.root())?;
     if let Some(speed) = arguments.speed {
         config.clock.speed = speed;
@@ -63,8 +66,7 @@ pub fn resume(arguments: &Resume) -> anyhow::Result<Exit> {
     check_object(&config)?;
     config.mission.version = env!("CARGO_PKG_VERSION").to_owned();
     let claim = claim_instance(&mut config)?;
-    check_shared_memory(&config)?;
-    check_disk(folder.root(), &config)?;
+    check_machine(folder.root(), &config)?;
     mission(&folder, &config, &format!("fly-{}", std::process::id()), arguments.json, claim)
 }
 
@@ -326,6 +328,13 @@ fn verdict(folder: &MissionFolder, flight: &Flight) -> anyhow::Result<Exit> {
     let logs = folder.root().join("logs");
     match &flight.outcome {
         Outcome::Done => Ok(Exit::Ok),
+        Outcome::Failed if flight.last.as_ref().and_then(supervise::run::end_reason) == Some(EndReason::Misaligned) => {
+            let why = evaluate::journal::read(&folder.journal_path())?.misaligned;
+            let why = why.as_deref().unwrap_or("no reason given");
+            let way_out =
+                format!("put it back as it was, and {resume} goes on; what was taken is there, `vantage evaluate`");
+            Err(Refusal::failed(format!("the mission is not gone on with: {why}; {way_out} measures it")))
+        }
         Outcome::Failed => {
             let reason = flight
                 .last

@@ -1,8 +1,9 @@
-//! What a mission needs of this machine before it may take off: shared memory and disk space.
+//! What a mission needs of this machine before it may take off: descriptors, shared memory and disk space.
 
 use std::path::Path;
 
 use rustix::fs::statvfs;
+use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 use shared_types::bus::Limits;
 use shared_types::channel::{Channel, ChannelVisitor, visit_all};
 use shared_types::config::Config;
@@ -15,6 +16,9 @@ const GAUSSIAN_BYTES: u64 = size_of::<shared_types::messages::GaussianRow>() as 
 
 /// What connections, service descriptions and the odd tool that looks in take besides, bytes.
 const BESIDES_BYTES: u64 = 16 << 20;
+
+/// Files that a process must be able to open. The planner has 145 open in flight, the keeper 139.
+pub const DESCRIPTORS: u64 = 512;
 
 struct Reserved {
     limits: Limits,
@@ -52,15 +56,46 @@ pub fn space_bytes(path: &Path) -> std::io::Result<(u64, u64)> {
     Ok((status.f_blocks * status.f_frsize, status.f_bavail * status.f_frsize))
 }
 
+/// Everything that keeps this machine from flying this mission into a folder.
+///
+/// # Errors
+/// Exit 69, with what is missing and the way out.
+pub fn check_machine(folder: &Path, config: &Config) -> anyhow::Result<()> {
+    check_descriptors()?;
+    check_shared_memory(config)?;
+    check_disk(folder, config)
+}
+
+/// Files that this process may open, and those that it starts: as many as it may allow itself.
+#[must_use]
+pub fn raised_descriptors() -> u64 {
+    let limit = getrlimit(Resource::Nofile);
+    let most = limit.maximum.unwrap_or(u64::MAX);
+    let now = limit.current.unwrap_or(u64::MAX);
+    if now < DESCRIPTORS && now < most {
+        let raised = Rlimit { current: Some(most.min(2 * DESCRIPTORS)), ..limit };
+        if setrlimit(Resource::Nofile, raised).is_ok() {
+            return most.min(2 * DESCRIPTORS);
+        }
+    }
+    now
+}
+
+fn check_descriptors() -> anyhow::Result<()> {
+    match raised_descriptors() {
+        limit if limit >= DESCRIPTORS => Ok(()),
+        limit => Err(Refusal::missing(format!(
+            "a process may open {limit} files, expected at least {DESCRIPTORS}: `ulimit -n 1024`, in a unit LimitNOFILE=1024, \
+             in a container `--ulimit nofile=1024`"
+        ))),
+    }
+}
+
 fn mib(bytes: u64) -> u64 {
     bytes.div_ceil(1 << 20)
 }
 
-/// Refuses a machine without enough shared memory.
-///
-/// # Errors
-/// Exit 69, with what is missing and the way out.
-pub fn check_shared_memory(config: &Config) -> anyhow::Result<()> {
+fn check_shared_memory(config: &Config) -> anyhow::Result<()> {
     let need = shared_memory_need_bytes(config);
     match space_bytes(Path::new(SHARED_MEMORY_DIR)) {
         Err(error) => Err(Refusal::missing(format!(
@@ -78,11 +113,7 @@ pub fn check_shared_memory(config: &Config) -> anyhow::Result<()> {
     }
 }
 
-/// Refuses a disk that cannot hold the mission.
-///
-/// # Errors
-/// Exit 69, with what is missing and the way out.
-pub fn check_disk(folder: &Path, config: &Config) -> anyhow::Result<()> {
+fn check_disk(folder: &Path, config: &Config) -> anyhow::Result<()> {
     let need = disk_need_bytes(config);
     // Nothing is made before it is known to fit: the disk is that of the nearest folder that is there.
     let there = folder.ancestors().find(|ancestor| ancestor.exists()).unwrap_or(Path::new("/"));

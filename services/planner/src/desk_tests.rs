@@ -122,7 +122,7 @@ fn a_slow_disk_holds_nobody_up() {
 fn what_was_in_flight_can_be_forgotten_while_its_line_is_kept() {
     let (folder, disk, _mount, mut desk) = on_a_full_disk(0);
     let mut outputs = turn(1);
-    let request = shared_types::messages::CommandRequest { command: 1, reserved: 0, altitude_m: 0.0 };
+    let request = shared_types::messages::CommandRequest { command: 1, ..Default::default() };
     outputs.effects.push(Effect::Command(1, request));
     desk.put(outputs).unwrap();
     assert_eq!(desk.settle(0, LONG).unwrap(), Settled::Refused);

@@ -169,6 +169,27 @@ pub enum Record {
         /// Points left out: too low, unsafe, beyond the gimbal.
         left_out: [u32; 3],
     },
+    /// The world is to be moved: where the estimator has put its origin, the object is not.
+    Shift {
+        /// What positions in the world change by, metres.
+        shift_m: [f64; 3],
+        /// The vehicle's reset counter when that was measured.
+        reset_count: u32,
+    },
+    /// The object is where, and as, the prior's views show it, within a residual: views may be taken.
+    Aligned {
+        /// What was left to move and was not, metres.
+        shift_m: [f64; 3],
+        /// Root mean square between the object's surfaces then and now, metres.
+        residual_m: f64,
+    },
+    /// It is not; the vehicle comes home and the mission stays open.
+    Misaligned {
+        /// Root mean square between the object's surfaces then and now, metres; absent where it was not found at all.
+        residual_m: Option<f64>,
+        /// In words.
+        why: String,
+    },
     /// A training round is asked for.
     Round {
         /// Number, from 0.

@@ -71,8 +71,14 @@ pub struct Ledger {
     pub scans: u32,
     /// Whether a scan is going on.
     pub scanning: bool,
-    /// The prior views taken since the last survey, by reason code.
-    pub prior_views: BTreeMap<u32, u64>,
+    /// The prior views taken since the last survey, by reason code: id, and mission time of the record.
+    pub prior_views: BTreeMap<u32, (u64, u64)>,
+    /// When the world was last known to lie where the prior says.
+    pub placed_ns: Option<u64>,
+    /// How the world is being moved, and the vehicle's reset counter before that.
+    pub shift: Option<([f64; 3], u32)>,
+    /// How often it was moved since it was last in place.
+    pub shifts: u32,
     /// The prior, and the gimbal's limits that go with it.
     pub prior: Option<(Prior, [f64; 2])>,
     /// Keyframes, in the order of capture.
@@ -132,7 +138,9 @@ impl Ledger {
             Record::Capture { shot, .. } => {
                 self.captures.insert(shot.keyframe_id, *shot);
             }
-            Record::Captured { keyframe_id, position_m, .. } => self.captured(*keyframe_id, *position_m),
+            Record::Captured { keyframe_id, position_m, .. } => {
+                self.captured(*keyframe_id, *position_m, entry.now_ns);
+            }
             Record::CaptureFailed { keyframe_id, .. } => *self.failures.entry(*keyframe_id).or_insert(0) += 1,
             Record::Dropped { keyframe_id, candidate, .. } => {
                 for batch in &mut self.batches {
@@ -151,7 +159,26 @@ impl Ledger {
                 self.scanning = false;
                 self.prior_views.clear();
             }
-            Record::Prior { prior, pitch_limits_rad, .. } => self.prior = Some((*prior, *pitch_limits_rad)),
+            Record::Prior { prior, pitch_limits_rad, .. } => {
+                self.prior = Some((*prior, *pitch_limits_rad));
+                self.placed_ns = Some(entry.now_ns);
+            }
+            Record::Shift { shift_m, reset_count } => {
+                self.shift = Some((*shift_m, *reset_count));
+                self.shifts += 1;
+                self.forget_checks();
+            }
+            Record::Aligned { .. } => {
+                self.placed_ns = Some(entry.now_ns);
+                self.shift = None;
+                self.shifts = 0;
+            }
+            // Another try counts anew.
+            Record::Misaligned { .. } => {
+                self.shift = None;
+                self.shifts = 0;
+                self.forget_checks();
+            }
             Record::Round { round, views, max_iterations } => self.rounds.push(Round {
                 request: entry.id,
                 round: *round,
@@ -198,11 +225,16 @@ impl Ledger {
         }
     }
 
-    fn captured(&mut self, keyframe_id: u64, position_m: [f64; 3]) {
+    fn forget_checks(&mut self) {
+        self.prior_views.remove(&KeyframeReason::CheckOverhead.code());
+        self.prior_views.remove(&KeyframeReason::CheckSide.code());
+    }
+
+    fn captured(&mut self, keyframe_id: u64, position_m: [f64; 3], now_ns: u64) {
         let Some(shot) = self.captures.get(&keyframe_id).copied() else { return };
         match shot.reason {
-            KeyframeReason::PriorOverhead | KeyframeReason::PriorSide => {
-                self.prior_views.insert(shot.reason.code(), keyframe_id);
+            reason if reason.is_survey() => {
+                self.prior_views.insert(reason.code(), (keyframe_id, now_ns));
             }
             _ if self.taken.iter().any(|taken| taken.shot.keyframe_id == keyframe_id) => {}
             _ => {

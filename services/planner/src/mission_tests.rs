@@ -221,6 +221,45 @@ fn a_planner_whose_process_is_to_end_lands_and_the_next_one_goes_on() {
 }
 
 #[test]
+fn after_a_reboot_the_world_is_found_again() {
+    for (at, moved_m) in [(4000, DVec3::new(1.9, -1.4, 0.8)), (6000, DVec3::new(-0.7, 0.2, -0.6)), (6000, DVec3::ZERO)]
+    {
+        let commands = BTreeMap::from([(at, MissionCommand::Recall)]);
+        let (mut world, _) = fly(short(), Faults { commands, ..Faults::default() });
+        let before = world.keyframes();
+        world.reboot(moved_m, rock());
+        let end = world.fly(2000.0);
+        assert_eq!((end, world.keyframes()), (EndReason::Complete, 14), "{moved_m}: {before} before");
+        assert!(world.off_m.length() < 0.03, "still off by {} after {moved_m}", world.off_m);
+        let clearance_m = PlannerConfig::default().clearance_m;
+        assert!(world.least_clearance_m > clearance_m - 0.1, "{}", world.least_clearance_m);
+        assert!(world.journal.iter().any(|entry| matches!(entry.record, Record::Aligned { .. })));
+        // Once for this flight.
+        world.resume();
+        assert!(world.captures.values().all(|&count| count == 1));
+    }
+}
+
+#[test]
+fn an_object_that_is_gone_or_another_is_refused_with_the_figure() {
+    for scene in [Scene::default(), Scene::single(0.0, 0.0, DVec3::new(0.6, 2.4, 1.9))] {
+        let commands = BTreeMap::from([(6000, MissionCommand::Recall)]);
+        let (mut world, _) = fly(short(), Faults { commands, ..Faults::default() });
+        let before = world.keyframes();
+        world.reboot(DVec3::new(0.5, 0.3, 0.0), scene);
+        assert_eq!((world.fly(2000.0), world.keyframes()), (EndReason::Misaligned, before));
+        let why = world.journal.iter().rev().find_map(|entry| match &entry.record {
+            Record::Misaligned { why, .. } => Some(why.clone()),
+            _ => None,
+        });
+        assert!(why.is_some_and(|why| why.contains("object")));
+        // Put back, it goes on.
+        world.reboot(DVec3::new(-0.5, 0.3, 0.0), rock());
+        assert_eq!((world.fly(3000.0), world.keyframes()), (EndReason::Complete, 14));
+    }
+}
+
+#[test]
 fn a_held_mission_can_be_recalled_and_a_recalled_one_stopped() {
     let commands = BTreeMap::from([(6000, MissionCommand::Abort), (7000, MissionCommand::Recall)]);
     let (mut world, end) = fly(short(), Faults { commands, ..Faults::default() });

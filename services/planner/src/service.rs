@@ -3,7 +3,7 @@
 use std::time::{Duration, Instant};
 
 use shared_types::folder::{FolderError, MissionFolder};
-use shared_types::messages::{MissionCommand, ServiceState, mission_key};
+use shared_types::messages::{ServiceState, mission_key};
 use shared_types::service::{Context, HealthReport, Service, ServiceError, Step, StopAnswer};
 
 use shared_types::{TICK_NS, ns_from_s};
@@ -68,6 +68,7 @@ impl Planner {
             mission_id: config.mission.id.clone(),
             folder: root.clone(),
             seed: config.mission.seed,
+            epoch_ns: config.mission.epoch_ns,
         };
         ports.count_within(mission_key(&setup.mission_id, &setup.folder));
         tracing::info!(entries = entries.len(), "the journal is read");
@@ -94,7 +95,7 @@ impl Planner {
 impl Planner {
     /// Takes a turn of the mission: what it decides lies on the desk then, or is done where there is nothing to write.
     fn decide(&mut self, now_ns: u64) -> Result<(), ServiceError> {
-        let mut inputs = core::mem::take(&mut self.inputs);
+        let inputs = core::mem::take(&mut self.inputs);
         if self.stopping {
             // Not the operator's stop: he may only want this process away, and the mission goes on after that.
             self.stopping = false;

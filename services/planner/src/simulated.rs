@@ -54,8 +54,7 @@ struct Stored(BTreeMap<(u32, u64), DepthView>);
 
 impl Views for Stored {
     fn read(&mut self, reason: KeyframeReason, keyframe_id: u64) -> Option<(DepthView, bool)> {
-        let prior = [KeyframeReason::PriorOverhead, KeyframeReason::PriorSide].contains(&reason);
-        let code = if prior { reason.code() } else { 0 };
+        let code = if reason.is_survey() { reason.code() } else { 0 };
         self.0.get(&(code, keyframe_id)).map(|view| (view.clone(), false))
     }
 }
@@ -73,6 +72,7 @@ pub struct World {
     speed_mps: f64,
     arrived_tick: u64,
     command: Option<(u64, VehicleCommand, f64, u64)>,
+    shift: DVec3,
     replies: Vec<(u64, Reply)>,
     stored: Stored,
     pub captures: BTreeMap<u64, u32>,
@@ -83,6 +83,8 @@ pub struct World {
     gone_said: bool,
     pub state: Option<MissionState>,
     pub least_clearance_m: f64,
+    /// Where the vehicle truly is, from where it says it is: the estimator's origin has moved.
+    pub off_m: DVec3,
     pub seen_ids: BTreeSet<u64>,
 }
 
@@ -96,7 +98,7 @@ enum Reply {
 
 pub fn setup(planner: PlannerConfig, seed: u64) -> Setup {
     let camera = CameraConfig { width_px: 96, height_px: 72, ..CameraConfig::default() };
-    Setup { planner, camera, mission_id: "test".to_owned(), folder: "/tmp/test".to_owned(), seed }
+    Setup { planner, camera, mission_id: "test".to_owned(), folder: "/tmp/test".to_owned(), seed, epoch_ns: 0 }
 }
 
 impl World {
@@ -132,6 +134,7 @@ impl World {
             speed_mps: 0.0,
             arrived_tick: 0,
             command: None,
+            shift: DVec3::ZERO,
             replies: Vec::new(),
             stored: Stored(BTreeMap::new()),
             captures: BTreeMap::new(),
@@ -142,6 +145,7 @@ impl World {
             gone_said: false,
             state: None,
             least_clearance_m: f64::INFINITY,
+            off_m: DVec3::ZERO,
             seen_ids: BTreeSet::new(),
         }
     }
@@ -173,6 +177,25 @@ impl World {
             self.step();
         }
         self.mission.as_mut().unwrap().step_down();
+    }
+
+    /// Everything is started anew: the estimator's origin has moved by this, and `vantage resume` goes on. `scene`: what
+    /// stands there now.
+    pub fn reboot(&mut self, moved_m: DVec3, scene: Scene) {
+        self.setup.epoch_ns = self.tick * TICK_NS + 1_000_000_000;
+        self.tick += 100;
+        let moved_m = moved_m - self.off_m;
+        self.move_world(-moved_m);
+        self.scene = scene;
+        self.resume();
+    }
+
+    fn move_world(&mut self, by_m: DVec3) {
+        self.off_m -= by_m;
+        self.vehicle.reset_count += 1;
+        for place in [&mut self.vehicle.position_m, &mut self.vehicle.setpoint_position_m, &mut self.vehicle.home_m] {
+            *place = (DVec3::from_array(*place) + by_m).to_array();
+        }
     }
 
     /// Another planner for the same folder: its journal is all that it knows.
@@ -230,7 +253,7 @@ impl World {
             if self.faults.wall {
                 scene.boxes.push((DVec3::new(-0.2, 3.4, 0.0), DVec3::new(0.2, 5.0, 3.0)));
             }
-            inputs.depths.push(scene.render(now_ns, self.camera_pose(), small));
+            inputs.depths.push(self.look(&scene, now_ns, small));
         }
         let Some(mission) = &mut self.mission else { return };
         let outputs = mission.step(now_ns, inputs, &mut self.stored);
@@ -249,9 +272,16 @@ impl World {
     fn check_clearance(&mut self) {
         if let Some((low, high)) = self.scene.boxes.first() {
             let object = Obstacle { center_m: (*low + *high) / 2.0, half_m: (*high - *low) / 2.0 };
-            let distance = object.distance(DVec3::from_array(self.vehicle.position_m));
+            let distance = object.distance(DVec3::from_array(self.vehicle.position_m) + self.off_m);
             self.least_clearance_m = self.least_clearance_m.min(distance);
         }
+    }
+
+    /// What the camera sees where it truly is, with the pose that is measured.
+    fn look(&self, scene: &Scene, now_ns: u64, intrinsics: Intrinsics) -> DepthView {
+        let measured = self.camera_pose();
+        let truly = Pose { position_m: measured.position_m + self.off_m, ..measured };
+        DepthView { world_from_camera: measured, ..scene.render(now_ns, truly, intrinsics) }
     }
 
     fn camera_pose(&self) -> Pose {
@@ -329,8 +359,8 @@ impl World {
         match mode {
             FlightMode::Land if v.landed == 0 => {
                 v.position_m[2] -= 0.007;
-                if v.position_m[2] <= 0.0 {
-                    v.position_m[2] = 0.0;
+                if v.position_m[2] + self.off_m.z <= 0.0 {
+                    v.position_m[2] = -self.off_m.z;
                     v.landed = 1;
                     v.streaming = 0;
                     self.arrived_tick = self.tick;
@@ -342,7 +372,8 @@ impl World {
                 v.commander = Commander::Nobody.code();
             }
             FlightMode::Return => {
-                let to = DVec3::from_array(v.home_m).with_z(6.0) - DVec3::from_array(v.position_m);
+                let above = DVec3::from_array(v.home_m).with_z(6.0 - self.off_m.z);
+                let to = above - DVec3::from_array(v.position_m);
                 let step = to.clamp_length_max(0.03);
                 v.position_m = (DVec3::from_array(v.position_m) + step).to_array();
                 if to.length() < 0.05 {
@@ -401,7 +432,7 @@ impl World {
                 v.commander = Commander::Vantage.code();
                 v.landed = 0;
                 v.position_m[2] += 0.015;
-                let up = v.position_m[2] >= altitude_m;
+                let up = v.position_m[2] + self.off_m.z >= altitude_m;
                 if up {
                     v.mode = FlightMode::Hold.code();
                 }
@@ -424,6 +455,18 @@ impl World {
                 v.streaming = 0;
                 true
             }
+            VehicleCommand::ShiftWorld => {
+                if v.landed == 0 {
+                    v.mode = FlightMode::Hold.code();
+                    v.streaming = 0;
+                }
+                let done = self.tick > since + 20;
+                if done {
+                    let by_m = self.shift;
+                    self.move_world(by_m);
+                }
+                done
+            }
             VehicleCommand::Land => {
                 v.mode = FlightMode::Land.code();
                 true
@@ -444,8 +487,14 @@ impl World {
             Effect::Target(target, points) => self.take_target(target, points),
             Effect::Command(id, request) => {
                 let command = VehicleCommand::from_code(request.command).unwrap();
+                if command == VehicleCommand::ShiftWorld {
+                    assert_eq!(request.reset_count, self.vehicle.reset_count);
+                    self.shift = DVec3::from_array(request.shift_m);
+                }
                 self.command = Some((id, command, request.altitude_m, self.tick));
-                if [VehicleCommand::Land, VehicleCommand::Return, VehicleCommand::Hold].contains(&command) {
+                if [VehicleCommand::Land, VehicleCommand::Return, VehicleCommand::Hold, VehicleCommand::ShiftWorld]
+                    .contains(&command)
+                {
                     self.drop_target();
                 }
             }
@@ -565,7 +614,7 @@ impl World {
             let pose = self.camera_pose();
             let to = (DVec3::from_array(request.look_at_m) - pose.position_m).normalize();
             assert!((pose.rotation * DVec3::Z).angle_between(to) < 0.37, "{reason} looks elsewhere");
-            let view = self.scene.render(self.tick * TICK_NS, pose, self.setup.camera.intrinsics());
+            let view = self.look(&self.scene, self.tick * TICK_NS, self.setup.camera.intrinsics());
             self.stored.0.insert(key, view);
             *self.captures.entry(request.keyframe_id).or_insert(0) += 1;
         }

@@ -6,6 +6,7 @@
 
 use std::collections::VecDeque;
 
+use glam::DVec3;
 use mavlink::dialects::common::{MavCmd, MavResult};
 use shared_types::messages::{FlightMode, VehicleCommand};
 
@@ -48,6 +49,8 @@ pub enum Stage {
     StreamPose,
     /// Fly the stored return path.
     FlyBack,
+    /// Move the world, metres.
+    ShiftWorld(DVec3),
     /// Wait until it is on the ground and disarmed.
     UntilDisarmed,
 }
@@ -84,6 +87,8 @@ pub enum Wish {
     StopStream,
     /// Fly the stored return path.
     FlyBack,
+    /// Move the world, metres.
+    ShiftWorld(DVec3),
 }
 
 /// What became of a turn.
@@ -178,6 +183,9 @@ impl Procedure {
             if stage == Stage::StreamPose || (stage == Stage::UntilSlow && view.streaming) {
                 wishes.push(Wish::Anchor);
             }
+            if let Stage::ShiftWorld(by_m) = stage {
+                wishes.push(Wish::ShiftWorld(by_m));
+            }
             if self.is_over(stage, view, age_ns) {
                 if let Stage::Mode { mode, .. } = stage
                     && mode != FlightMode::Offboard
@@ -223,6 +231,7 @@ impl Procedure {
             Stage::UntilSlow => view.speed_mps < 0.3 || age_ns > 2_000_000_000,
             Stage::StreamPose => view.streaming && age_ns >= STREAM_FIRST_NS,
             Stage::FlyBack => view.flown_back && age_ns > 0,
+            Stage::ShiftWorld(_) => true,
             Stage::Disarm | Stage::UntilDisarmed => !view.armed,
         }
     }
@@ -312,7 +321,12 @@ fn give_up(stage: Stage, age_ns: u64) -> Option<String> {
         Stage::StreamPose => (5, "no setpoint can be sent"),
         Stage::FlyBack => (180, "the return path is not flown to its end"),
         Stage::UntilDisarmed => (300, "the vehicle does not land and disarm"),
-        Stage::Mode { .. } | Stage::Arm | Stage::Disarm | Stage::Takeoff { .. } | Stage::UntilSlow => return None,
+        Stage::Mode { .. }
+        | Stage::Arm
+        | Stage::Disarm
+        | Stage::Takeoff { .. }
+        | Stage::UntilSlow
+        | Stage::ShiftWorld(_) => return None,
     };
     (age_ns > limit_s * shared_types::NS_PER_S).then(|| reason.to_owned())
 }

@@ -169,7 +169,8 @@ impl WorldTransform {
         swap_ned_enu(world_m - self.offset_m())
     }
 
-    fn shift(&mut self, by_m: DVec3) {
+    /// Moves the transform: the world was found to lie elsewhere.
+    pub fn shift(&mut self, by_m: DVec3) {
         self.kept.offset_m = (self.offset_m() + by_m).to_array();
         self.kept.reset_count = self.kept.reset_count.saturating_add(1);
     }

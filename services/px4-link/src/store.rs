@@ -38,6 +38,15 @@ impl WayBack {
         waypoints.len() == self.points.len() && Path::new(start, &waypoints, limits).total_s() <= 2.0 * LONGEST_S
     }
 
+    /// The same places in a world that was moved.
+    pub fn shift(&mut self, by_m: glam::DVec3) {
+        for point in &mut self.points {
+            for (value, by) in point.iter_mut().zip(by_m.to_array()) {
+                *value += by;
+            }
+        }
+    }
+
     /// As waypoints; those with numbers that are not finite are left out.
     #[must_use]
     pub fn waypoints(&self) -> Vec<Waypoint> {

@@ -172,6 +172,11 @@ impl Estimator {
         self.attitude_error
     }
 
+    /// The estimator has put its origin elsewhere when it was started: from the world's, metres.
+    pub fn set_origin(&mut self, origin_m: DVec3) {
+        self.jump_m = -origin_m;
+    }
+
     /// The estimate jumps by a vector, as when an EKF resets; the reset counter says so.
     pub fn reset_by(&mut self, jump_m: DVec3) {
         if jump_m.is_finite() {

@@ -57,6 +57,7 @@ pub fn vehicle_config(config: &Config) -> VehicleConfig {
         estimator: EstimatorModel::from_name(simulator.estimator.name()).unwrap_or(EstimatorModel::Exact),
         start_enu_m: simulator.start_m,
         start_yaw_enu_rad: simulator.start_yaw_deg.to_radians(),
+        origin_enu_m: simulator.origin_m,
         wind_enu_mps: simulator.wind_mps,
         gust_mps: simulator.gust_mps,
         battery: simulator.battery,

@@ -34,6 +34,8 @@ pub struct VehicleConfig {
     pub start_enu_m: [f64; 2],
     /// Its heading at boot: counter-clockwise from east, radians.
     pub start_yaw_enu_rad: f64,
+    /// Where the estimator puts its origin, in the world (ENU), metres.
+    pub origin_enu_m: [f64; 3],
     /// Mean wind in the world (ENU), m/s.
     pub wind_enu_mps: [f64; 3],
     /// Gusts' standard deviation per axis, m/s.
@@ -53,6 +55,7 @@ impl Default for VehicleConfig {
             estimator: EstimatorModel::Exact,
             start_enu_m: [0.0, 0.0],
             start_yaw_enu_rad: core::f64::consts::FRAC_PI_2,
+            origin_enu_m: [0.0; 3],
             wind_enu_mps: [0.0; 3],
             gust_mps: 0.0,
             battery: 1.0,
@@ -130,6 +133,7 @@ impl Vehicle {
         let yaw = core::f64::consts::FRAC_PI_2 - config.start_yaw_enu_rad;
         let body = Body::standing(config.start_enu_m[1], config.start_enu_m[0], yaw);
         let mut estimator = Estimator::new(config.estimator, config.seed);
+        estimator.set_origin(enu_from_ned(DVec3::from_array(config.origin_enu_m)));
         let estimate = estimator.step(&body, TICK_S / f64::from(SUBSTEPS));
         Ok(Self {
             autopilot: Autopilot::default(),

@@ -44,6 +44,9 @@ pub struct SimulatorConfig {
     pub start_m: [f64; 2],
     /// Heading at boot: counter-clockwise from east, degrees.
     pub start_yaw_deg: f64,
+    /// Where the estimator puts its origin, from where the world's is: metres east, north and up. For `vantage resume`, as
+    /// after a reboot; the world of a first flight lies where its estimator puts it.
+    pub origin_m: [f64; 3],
     /// Mean wind: metres per second toward east, north and up.
     pub wind_mps: [f64; 3],
     /// Standard deviation of the gusts on each axis, m/s.
@@ -65,6 +68,7 @@ impl Default for SimulatorConfig {
             estimator: EstimatorName::Exact,
             start_m: [-6.0, 0.0],
             start_yaw_deg: 0.0,
+            origin_m: [0.0; 3],
             wind_mps: [0.0; 3],
             gust_mps: 0.0,
             battery: 1.0,
@@ -89,6 +93,7 @@ impl SimulatorConfig {
         within("simulator.start_m[1]", self.start_m[1], -1e4, 1e4);
         within("simulator.start_yaw_deg", self.start_yaw_deg, -360.0, 360.0);
         for axis in 0..3 {
+            within("simulator.origin_m", self.origin_m[axis], -20.0, 20.0);
             within("simulator.wind_mps", self.wind_mps[axis], -30.0, 30.0);
         }
         within("simulator.gust_mps", self.gust_mps, 0.0, 15.0);

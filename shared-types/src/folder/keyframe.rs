@@ -189,11 +189,10 @@ impl MissionFolder {
         let json = serde_json::to_vec_pretty(frame)
             .map_err(|error| damaged(&json_path, "frame", &error.to_string(), "numbers that JSON can hold"))?;
         let files: [(&str, &[u8]); 3] = [("rgb.png", &rgb), ("depth.png", &depth), ("frame.json", &json)];
-        match frame.reason {
-            KeyframeReason::PriorOverhead | KeyframeReason::PriorSide => replace_dir_atomic(&path, &files)?,
-            KeyframeReason::Seed | KeyframeReason::Selected | KeyframeReason::Stream => {
-                write_dir_atomic(&path, &files)?;
-            }
+        if frame.reason.is_survey() {
+            replace_dir_atomic(&path, &files)?;
+        } else {
+            write_dir_atomic(&path, &files)?;
         }
         Ok(path)
     }
@@ -211,10 +210,7 @@ impl MissionFolder {
     /// # Errors
     /// As [`Self::read_keyframe`].
     pub fn read_prior(&self, reason: KeyframeReason) -> Result<Option<Keyframe>, FolderError> {
-        match reason {
-            KeyframeReason::PriorOverhead | KeyframeReason::PriorSide => self.read_view(reason, 0),
-            KeyframeReason::Stream | KeyframeReason::Seed | KeyframeReason::Selected => Ok(None),
-        }
+        if reason.is_survey() { self.read_view(reason, 0) } else { Ok(None) }
     }
 
     /// Reads the `frame.json` of the view that a reason and an id name, without its images; `None` when there is none.
@@ -235,8 +231,7 @@ impl MissionFolder {
     pub fn read_view(&self, reason: KeyframeReason, id: u64) -> Result<Option<Keyframe>, FolderError> {
         let Some(path) = self.view_path(reason, id).filter(|path| path.is_dir()) else { return Ok(None) };
         let keyframe = read_view_folder(&path)?;
-        let is_prior = matches!(reason, KeyframeReason::PriorOverhead | KeyframeReason::PriorSide);
-        if !is_prior && keyframe.frame.id != id {
+        if !reason.is_survey() && keyframe.frame.id != id {
             let json_path = path.join("frame.json");
             return Err(damaged(&json_path, "id", &keyframe.frame.id.to_string(), &format!("{id} as its folder says")));
         }

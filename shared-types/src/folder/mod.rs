@@ -190,7 +190,7 @@ impl MissionFolder {
         self.keyframes_path().join(format!("{id:06}"))
     }
 
-    /// `prior`: the two views of the prior.
+    /// `prior`: the two views of the prior, and those that checked them.
     #[must_use]
     pub fn prior_path(&self) -> PathBuf {
         self.root.join("prior")
@@ -204,6 +204,8 @@ impl MissionFolder {
             KeyframeReason::Stream => None,
             KeyframeReason::PriorOverhead => Some(self.prior_path().join("overhead")),
             KeyframeReason::PriorSide => Some(self.prior_path().join("side")),
+            KeyframeReason::CheckOverhead => Some(self.prior_path().join("check-overhead")),
+            KeyframeReason::CheckSide => Some(self.prior_path().join("check-side")),
             KeyframeReason::Seed | KeyframeReason::Selected => Some(self.keyframe_path(id)),
         }
     }

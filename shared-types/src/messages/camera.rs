@@ -18,6 +18,18 @@ codes! {
         Seed = 3, "seed",
         /// A view chosen by the selector.
         Selected = 4, "selected",
+        /// The overhead view of the prior again, to find where the world has gone.
+        CheckOverhead = 5, "check-overhead",
+        /// The side view of the prior again.
+        CheckSide = 6, "check-side",
+    }
+}
+
+impl KeyframeReason {
+    /// Whether a view taken for this lies under `prior/`, where the next one takes its place: no keyframe of the model.
+    #[must_use]
+    pub fn is_survey(self) -> bool {
+        matches!(self, Self::PriorOverhead | Self::PriorSide | Self::CheckOverhead | Self::CheckSide)
     }
 }
 

@@ -139,7 +139,8 @@ impl Check<Waypoint> for VehicleTarget {
 impl Check for CommandRequest {
     fn check(&self, items: &[u8]) -> Result<(), Fault> {
         none(items)?;
-        real("altitude_m", &[self.altitude_m])
+        real("altitude_m", &[self.altitude_m])?;
+        real("shift_m", &self.shift_m)
     }
 }
 

@@ -74,6 +74,8 @@ codes! {
         VehicleRefused = 11, "vehicle-refused",
         /// Wind above the limit.
         Wind = 12, "wind",
+        /// After `vantage resume` the object was not found where, or as, the prior's views show it. The mission stays open.
+        Misaligned = 13, "misaligned",
     }
 }
 

@@ -216,18 +216,24 @@ codes! {
         Land = 6, "land",
         /// The operator's word that Vantage may command again after a pilot or a failsafe.
         GoOn = 7, "go-on",
+        /// The world lies elsewhere than the estimator's origin says: add `shift_m` to the transform. In the air the vehicle
+        /// holds for it, and has to be taken control of again.
+        ShiftWorld = 8, "shift-world",
     }
 }
 
 payload! {
     /// Request of `vehicle/command`.
-    pub struct CommandRequest [16] {
+    pub struct CommandRequest [40] {
         /// [`VehicleCommand`] code.
         pub command: u32,
-        /// Unused, zero.
-        pub reserved: u32,
+        /// For `ShiftWorld`, [`VehicleState::reset_count`] as it was when the shift was measured; refused where it is another
+        /// by now.
+        pub reset_count: u32,
         /// Height above home for `Takeoff`, metres.
         pub altitude_m: f64,
+        /// For `ShiftWorld`, what to add to positions in the world, metres.
+        pub shift_m: [f64; 3],
     }
 }
 

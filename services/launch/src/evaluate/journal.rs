@@ -34,6 +34,8 @@ pub struct Journal {
     pub end_reason: Option<String>,
     /// Whether it is over, and if so, whether with a usable model.
     pub over: Option<bool>,
+    /// Why the last flight did not go on with the mission: its object was not found as it was.
+    pub misaligned: Option<String>,
     /// Stamp of the last whole line.
     pub last_ns: Option<u64>,
 }
@@ -131,6 +133,7 @@ fn summarise(bytes: &[u8]) -> Journal {
                 journal.iterations = entry["total_iterations"].as_u64().and_then(|count| u32::try_from(count).ok());
                 journal.psnr_train_db = entry["psnr_train_db"].as_f64();
             }
+            "misaligned" => journal.misaligned = entry["why"].as_str().map(str::to_owned),
             "ending" | "over" => {
                 journal.end_reason = entry["reason"].as_str().map(str::to_owned);
                 if event == "over" {

@@ -173,7 +173,7 @@ impl Ports {
     /// When the request cannot be sent; it is kept and sent again.
     pub fn command_vehicle(&mut self, command: VehicleCommand) -> Result<(), BusError> {
         self.next_id += 1;
-        let request = CommandRequest { command: command.code(), reserved: 0, altitude_m: 0.0 };
+        let request = CommandRequest { command: command.code(), ..CommandRequest::default() };
         self.vehicle_commands.send(self.now_ns(), self.next_id, &request, &[])
     }
 }

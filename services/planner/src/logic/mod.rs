@@ -1,5 +1,6 @@
 //! Pure logic: no IPC, no clock, no global random source. Time and seeds come in as arguments.
 
+pub mod align;
 pub mod candidates;
 pub mod cost;
 pub mod coverage;

@@ -3,8 +3,8 @@
 use glam::DVec3;
 use shared_types::config::planner::{BatchOrder, Transit};
 use shared_types::messages::{
-    CaptureRequest, CaptureStatus, Commander, EndReason, FlightMode, TargetStatus, VehicleState, VehicleTarget,
-    Waypoint, mission_key,
+    CaptureRequest, CaptureStatus, Commander, EndReason, FlightMode, KeyframeReason, TargetStatus, VehicleState,
+    VehicleTarget, Waypoint, mission_key,
 };
 use shared_types::ns_from_s;
 use shared_types::payload::unpack_text;
@@ -43,6 +43,10 @@ impl Mission {
         if self.ledger.ending.is_some_and(|(_, land_here)| land_here) {
             return State::Landing;
         }
+        if !self.homeward() && self.shifting(&vehicle) {
+            // px4-link holds for that.
+            return State::Deciding;
+        }
         if !Self::under_control(&vehicle) {
             return State::Launching;
         }
@@ -59,6 +63,9 @@ impl Mission {
         }
         if self.ledger.prior.is_none() {
             return self.survey(&vehicle, views);
+        }
+        if !self.is_placed() {
+            return self.find_world(&vehicle, views);
         }
         self.recover_captured(views);
         let left: Vec<Shot> = self.ledger.current().map(|(_, batch)| batch.left.clone()).unwrap_or_default();
@@ -432,6 +439,10 @@ impl Mission {
     }
 
     fn give_up(&mut self, shot: &Shot, why: String) {
+        if matches!(shot.reason, KeyframeReason::CheckOverhead | KeyframeReason::CheckSide) {
+            self.misaligned(None, &format!("the prior's views cannot be taken again: {why}"));
+            return;
+        }
         if shot.keyframe_id >= PRIOR_IDS {
             // Without the prior there is no mission.
             let blocked = !self.ledger.failures.contains_key(&shot.keyframe_id);

@@ -4,6 +4,7 @@
 //! is found again from the vehicle's state. A turn gives back the records first: they are on disk before their effects.
 
 mod flight;
+mod frame;
 mod report;
 mod rounds;
 mod survey;
@@ -46,6 +47,8 @@ pub struct Setup {
     pub folder: String,
     /// Seed of everything random.
     pub seed: u64,
+    /// Mission time at which `vantage fly` or `vantage resume` began: what lies before was measured in another flight.
+    pub epoch_ns: u64,
 }
 
 /// A command that is being waited for.
@@ -64,6 +67,8 @@ struct Pending {
 struct Terrain {
     survey_m: DVec3,
     home_m: DVec3,
+    /// The vehicle's, when this was made.
+    reset_count: u32,
     space: FreeSpace,
     roadmap: Roadmap,
     candidates: Candidates,
@@ -101,6 +106,8 @@ pub struct Mission {
     stepping_down: bool,
     /// Told to end before it began.
     cancelled: bool,
+    /// The object was not found as it was: recalled for that.
+    misaligned: bool,
     published: Option<(MissionState, u64)>,
     sequence: u64,
     out: Outputs,
@@ -152,6 +159,7 @@ impl Mission {
             recalled: false,
             stepping_down: false,
             cancelled: false,
+            misaligned: false,
             published: None,
             sequence: 0,
             out: Outputs::default(),
@@ -367,6 +375,11 @@ impl Mission {
 
     /// Sees that a command is carried out: issues it, and gives its answer once. A refused command rests for 2 s.
     fn ensure(&mut self, command: VehicleCommand, altitude_m: f64) -> Option<Result<(), String>> {
+        self.ensure_request(CommandRequest { command: command.code(), altitude_m, ..CommandRequest::default() })
+    }
+
+    fn ensure_request(&mut self, request: CommandRequest) -> Option<Result<(), String>> {
+        let command = VehicleCommand::from_code(request.command)?;
         if let Some(pending) = &mut self.pending {
             if pending.command == command {
                 // A pilot who is to arm takes the time he needs.
@@ -391,9 +404,8 @@ impl Mission {
             self.out.effects.push(Effect::CommandOver(id));
         }
         if self.now_ns >= self.retry_ns {
-            let id = self.record(Record::Command { command, altitude_m });
+            let id = self.record(Record::Command { command, altitude_m: request.altitude_m });
             self.pending = Some(Pending { id, command, since_ns: self.now_ns, accepted: false, answer: None });
-            let request = CommandRequest { command: command.code(), reserved: 0, altitude_m };
             self.out.effects.push(Effect::Command(id, request));
         }
         None
@@ -421,13 +433,18 @@ impl Mission {
     /// Sees that the terrain is known, as far as the journal knows it.
     fn ensure_terrain(&mut self) {
         let Some((_, home_m)) = self.ledger.airborne else { return };
-        if self.terrain.is_some() {
+        let placed = self.is_placed();
+        let reset_count = self.vehicle.map_or(0, |vehicle| vehicle.reset_count);
+        // A world that is being looked for takes everything along when it moves.
+        if self.terrain.as_ref().is_some_and(|terrain| placed || terrain.reset_count == reset_count) {
             return;
         }
         let config = &self.setup.planner;
+        // In a world that is not yet found again nothing is where it was: neither the object nor where this began.
+        let home_m = self.vehicle.filter(|_| !placed).map_or(home_m, |vehicle| vehicle.home_m);
         let (survey_m, home_m) = (self.survey_m(), DVec3::from_array(home_m));
         let volume = Volume::of_mission(survey_m, home_m, config);
-        let (space, candidates) = match &self.ledger.prior {
+        let (space, candidates) = match self.ledger.prior.as_ref().filter(|_| placed) {
             None => (FreeSpace::around_survey(survey_m, volume, config), Candidates::default()),
             Some((prior, limits)) => {
                 let space = FreeSpace::around_prior(prior, volume, self.mount.least_drop_m(), config);
@@ -437,7 +454,7 @@ impl Mission {
             }
         };
         let roadmap = Roadmap::new(&space);
-        self.terrain = Some(Terrain { survey_m, home_m, space, roadmap, candidates });
+        self.terrain = Some(Terrain { survey_m, home_m, reset_count, space, roadmap, candidates });
     }
 
     /// The terrain anew after the prior or the survey point changed; what was seen is kept where the volume is the same.

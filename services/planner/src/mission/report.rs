@@ -52,7 +52,11 @@ impl Mission {
         let ledger = &self.ledger;
         let config = &self.setup.planner;
         let usable = ledger.over.is_some_and(|(_, usable)| usable);
-        let unrecorded = if self.cancelled { EndReason::Operator } else { EndReason::None };
+        let unrecorded = match (self.cancelled, self.misaligned) {
+            (true, _) => EndReason::Operator,
+            (false, true) => EndReason::Misaligned,
+            (false, false) => EndReason::None,
+        };
         let reason = ledger.over.or(ledger.ending).map_or(unrecorded, |(reason, _)| reason);
         let prior = ledger.prior.map(|(prior, _)| prior);
         let count = |length: usize| u32::try_from(length).unwrap_or(u32::MAX);

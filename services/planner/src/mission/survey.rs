@@ -5,12 +5,13 @@ use core::f64::consts::{FRAC_PI_2, TAU};
 use glam::DVec3;
 use shared_types::config::planner::Strategy;
 use shared_types::messages::{EndReason, KeyframeReason, VehicleState};
-use shared_types::ns_from_s;
+use shared_types::{NS_PER_S, ns_from_s};
 
 use super::{Mission, PRIOR_IDS};
 use crate::io::{Inputs, Views};
 use crate::journal::{Record, Shot};
 use crate::logic::candidates::{PitchLimits, generate};
+use crate::logic::depth::DepthView;
 use crate::logic::prior::{estimate, find_object};
 use crate::logic::space::FreeSpace;
 use crate::logic::view::Aim;
@@ -26,18 +27,15 @@ impl Mission {
             return self.scan(vehicle);
         }
         for reason in [KeyframeReason::PriorOverhead, KeyframeReason::PriorSide] {
-            if !self.ledger.prior_views.contains_key(&reason.code()) {
+            if self.survey_view(reason).is_none() {
                 let shot = self.prior_shot(vehicle, reason);
                 return self.fly_next(vehicle, &[shot]);
             }
         }
         let config = &self.setup.planner;
         let survey_m = self.survey_m();
-        let read = |reason: KeyframeReason, views: &mut dyn Views| {
-            let id = self.ledger.prior_views.get(&reason.code()).copied().unwrap_or(PRIOR_IDS);
-            views.read(reason, id).map(|(view, _)| view)
-        };
-        let (overhead, side) = (read(KeyframeReason::PriorOverhead, views), read(KeyframeReason::PriorSide, views));
+        let [overhead, side] =
+            [KeyframeReason::PriorOverhead, KeyframeReason::PriorSide].map(|reason| self.read_survey(reason, views));
         let (Some(overhead), Some(side)) = (overhead, side) else {
             tracing::warn!("the views of the prior cannot be read from the mission folder");
             self.end(EndReason::ServiceFailed);
@@ -94,13 +92,26 @@ impl Mission {
         }
     }
 
-    fn prior_shot(&self, vehicle: &VehicleState, reason: KeyframeReason) -> Shot {
+    /// Id of the view taken for a reason, where that was in this flight: an earlier one's world lies elsewhere.
+    pub(super) fn survey_view(&self, reason: KeyframeReason) -> Option<u64> {
+        let (id, at_ns) = self.ledger.prior_views.get(&reason.code())?;
+        (*at_ns >= self.setup.epoch_ns).then_some(*id)
+    }
+
+    /// The newest view taken for a reason, of whichever flight.
+    pub(super) fn read_survey(&self, reason: KeyframeReason, views: &mut dyn Views) -> Option<DepthView> {
+        let (id, _) = self.ledger.prior_views.get(&reason.code())?;
+        views.read(reason, *id).map(|(view, _)| view)
+    }
+
+    pub(super) fn prior_shot(&self, vehicle: &VehicleState, reason: KeyframeReason) -> Shot {
         let config = &self.setup.planner;
         let survey_m = self.survey_m();
         let limits = self.pitch_limits(vehicle);
         let home = DVec3::from_array(self.ledger.airborne.map_or(vehicle.home_m, |(_, home_m)| home_m));
         let toward_home = (home - survey_m).with_z(0.0).normalize_or(DVec3::NEG_X);
-        let (position_m, look_at_m) = if reason == KeyframeReason::PriorOverhead {
+        let from_above = matches!(reason, KeyframeReason::PriorOverhead | KeyframeReason::CheckOverhead);
+        let (position_m, look_at_m) = if from_above {
             // Where the gimbal cannot look straight down, as steeply as it can from the same distance.
             let pitch = (-FRAC_PI_2).max(limits.min_rad);
             let away = toward_home * pitch.cos() - DVec3::Z * pitch.sin();
@@ -111,13 +122,20 @@ impl Mission {
             (side, survey_m + DVec3::Z * config.side_height_m / 2.0)
         };
         Shot {
-            keyframe_id: PRIOR_IDS + u64::from(self.ledger.scans) * 2 + u64::from(reason == KeyframeReason::PriorSide),
+            keyframe_id: self.survey_id(reason, from_above),
             reason,
             candidate: u32::MAX,
             position_m: position_m.to_array(),
             look_at_m: look_at_m.to_array(),
             score: 0.0,
         }
+    }
+
+    /// Another number in every flight, for every survey, and whenever the world has moved: the camera takes no image twice.
+    fn survey_id(&self, reason: KeyframeReason, from_above: bool) -> u64 {
+        let checks = matches!(reason, KeyframeReason::CheckOverhead | KeyframeReason::CheckSide);
+        let place = if checks { 500 + u64::from(self.ledger.shifts) * 2 } else { u64::from(self.ledger.scans) * 2 };
+        PRIOR_IDS + self.setup.epoch_ns / NS_PER_S * 1000 + place + u64::from(!from_above)
     }
 
     fn scan(&mut self, vehicle: &VehicleState) -> State {

@@ -44,7 +44,7 @@ impl Mission {
     /// Takes a small depth image into the occupied voxels. The object in its box and the ground are known, and no obstacle.
     pub(super) fn saw(&mut self, view: &DepthView) {
         let radius = self.setup.planner.survey_radius_m;
-        let prior = self.ledger.prior;
+        let prior = self.ledger.prior.filter(|_| self.is_placed());
         let Some(terrain) = &mut self.terrain else { return };
         let (survey, obstacle) = (terrain.survey_m, terrain.space.obstacle);
         terrain.space.occupancy.add(view, |point| match &prior {
@@ -126,7 +126,7 @@ impl Mission {
                 self.end(EndReason::Battery);
                 return State::Finishing;
             }
-            if vehicle.armable == 0 {
+            if vehicle.armable == 0 || !self.level_home(&vehicle) {
                 return State::Preparing;
             }
         }

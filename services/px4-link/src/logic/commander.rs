@@ -2,6 +2,7 @@
 
 use shared_types::messages::{ChargeState, Commander, FailsafeReason, FlightMode, VehicleCommand};
 
+use super::requests::Details;
 use super::{Core, INTENT_PATIENCE_NS, MODE_GRACE_NS, QUIET_NS, Running};
 use crate::commands::{Procedure, Stage};
 use crate::state::{Found, found_in_air};
@@ -127,7 +128,7 @@ impl Core {
         if self.landing {
             // On its way home when it was interrupted: by the autopilot's own return, which needs no setpoints.
             self.way_back = WayBack::default();
-            self.begin(now_ns, VehicleCommand::Return, 0.0, None);
+            self.begin(now_ns, VehicleCommand::Return, Details::default(), None);
         }
     }
 

@@ -2,6 +2,7 @@
 
 use shared_types::messages::{Commander, FlightMode, VehicleCommand};
 
+use super::requests::Details;
 use super::{Core, Running, WAY_TOLERANCE_M};
 use crate::commands::{Procedure, Stage};
 use crate::path::rest_from;
@@ -60,13 +61,13 @@ impl Core {
     /// Returns, lands and disarms on px4-link's own account.
     pub(super) fn go_home(&mut self, now_ns: u64, after_failure: Option<VehicleCommand>) {
         match after_failure {
-            None => self.begin(now_ns, VehicleCommand::Return, 0.0, None),
+            None => self.begin(now_ns, VehicleCommand::Return, Details::default(), None),
             // The way back could not be flown: the autopilot's own return, and when that fails too, down.
             Some(VehicleCommand::Return) if !self.way_back.points.is_empty() => {
                 self.way_back = WayBack::default();
-                self.begin(now_ns, VehicleCommand::Return, 0.0, None);
+                self.begin(now_ns, VehicleCommand::Return, Details::default(), None);
             }
-            Some(_) => self.begin(now_ns, VehicleCommand::Land, 0.0, None),
+            Some(_) => self.begin(now_ns, VehicleCommand::Land, Details::default(), None),
         }
     }
 

@@ -19,6 +19,18 @@ use crate::state::Phase;
 use crate::store::WayBack;
 use crate::stream::{Order, Report};
 
+/// A world that is farther off is not looked for: something else is wrong.
+const MOST_SHIFT_M: f64 = 20.0;
+
+/// What some commands need to know.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Details {
+    /// Height above home for a takeoff, metres.
+    pub altitude_m: f64,
+    /// How the world is moved, metres.
+    pub shift_m: DVec3,
+}
+
 fn reply(command: VehicleCommand, status: CommandStatus, reason: &str) -> CommandReply {
     CommandReply { status: status.code(), command: command.code(), reason: pack_text(reason) }
 }
@@ -118,9 +130,15 @@ impl Core {
             let blind = command == VehicleCommand::TakeControl && !self.telemetry.ready(now_ns);
             let no_home = command == VehicleCommand::Takeoff && self.telemetry.home.is_none();
             let wild = command == VehicleCommand::Takeoff && !(0.5..=120.0).contains(&request.altitude_m);
+            let shifts = command == VehicleCommand::ShiftWorld;
+            let elsewhere = shifts && request.reset_count != self.world.reset_count();
+            let shift_m = DVec3::from_array(request.shift_m).length();
+            let far = shifts && shift_m > MOST_SHIFT_M;
             (blind || no_home)
                 .then(|| "position, attitude or home are not known or not fresh".to_owned())
                 .or_else(|| wild.then(|| format!("altitude_m is {}; expected 0.5 to 120", request.altitude_m)))
+                .or_else(|| elsewhere.then(|| "the world has moved since; measure anew".to_owned()))
+                .or_else(|| far.then(|| format!("shift_m is {shift_m:.1} m; expected at most {MOST_SHIFT_M}")))
         });
         if let Some(reason) = objection {
             self.answer(address, reply(command, CommandStatus::Refused, &reason));
@@ -128,16 +146,18 @@ impl Core {
         }
         tracing::info!(%command, "commanded");
         self.answer(address, reply(command, CommandStatus::Accepted, ""));
-        self.begin(now_ns, command, request.altitude_m, Some(address));
+        let shift_m = DVec3::from_array(request.shift_m);
+        self.begin(now_ns, command, Details { altitude_m: request.altitude_m, shift_m }, Some(address));
     }
 
     /// Why a command cannot be taken on the way down.
     fn objection_while_ending(&self, command: VehicleCommand) -> Option<&'static str> {
-        use VehicleCommand::{Hold, Land, Return, TakeControl};
+        use VehicleCommand::{Hold, Land, Return, ShiftWorld, TakeControl};
         if self.leaving && !matches!(command, Hold | Return | Land) {
             return Some("px4-link was told to end; it takes hold, return and land");
         }
-        (self.landing && command == TakeControl).then_some("the vehicle returns or lands; command hold first")
+        (self.landing && matches!(command, TakeControl | ShiftWorld))
+            .then_some("the vehicle returns or lands; command hold first")
     }
 
     /// Starts a command; the one at work is superseded.
@@ -145,7 +165,7 @@ impl Core {
         &mut self,
         now_ns: u64,
         command: VehicleCommand,
-        altitude_m: f64,
+        details: Details,
         address: Option<ReplyAddress>,
     ) {
         self.drop_running(&format!("superseded by {command}"));
@@ -163,7 +183,8 @@ impl Core {
             VehicleCommand::Arm if in_control => vec![Stage::UntilArmable, Stage::Arm],
             VehicleCommand::Arm => vec![mode(FlightMode::Hold), Stage::UntilArmable, Stage::Arm],
             VehicleCommand::Takeoff => {
-                let above_sea_m = self.telemetry.home.map_or(0.0, |(_, above_sea_m)| above_sea_m) + altitude_m;
+                let home_m = self.telemetry.home.map_or(0.0, |(_, above_sea_m)| above_sea_m);
+                let above_sea_m = home_m + details.altitude_m;
                 vec![Stage::Takeoff { above_sea_m }, Stage::UntilHovering]
             }
             VehicleCommand::Hold => {
@@ -171,6 +192,11 @@ impl Core {
                 vec![mode(FlightMode::Hold)]
             }
             VehicleCommand::Return | VehicleCommand::Land | VehicleCommand::GoOn if on_ground => Vec::new(),
+            VehicleCommand::ShiftWorld if on_ground => vec![Stage::ShiftWorld(details.shift_m)],
+            // Setpoints of the world before must not flow while it moves.
+            VehicleCommand::ShiftWorld => {
+                vec![Stage::Mode { mode: FlightMode::Hold, always: true }, Stage::ShiftWorld(details.shift_m)]
+            }
             VehicleCommand::Return => self.stages_home(in_control),
             VehicleCommand::Land => vec![mode(FlightMode::Land), Stage::UntilDisarmed],
             VehicleCommand::GoOn => {
@@ -181,6 +207,17 @@ impl Core {
             }
         };
         self.running = Some(Running { procedure: Procedure::new(command, &stages), address });
+    }
+
+    /// The world moves under a vehicle that stays where it is: everything that is known in the world moves along.
+    fn shift_world(&mut self, by_m: DVec3) {
+        tracing::info!(?by_m, "the world is moved");
+        self.out.orders.push(Order::Off);
+        self.world.shift(by_m);
+        self.telemetry.position_m += by_m;
+        self.way_back.shift(by_m);
+        self.store.keep_way_back(&self.way_back);
+        self.remember();
     }
 
     pub(super) fn answer(&mut self, address: ReplyAddress, reply: CommandReply) {
@@ -249,6 +286,7 @@ impl Core {
                 }
                 Wish::Anchor => self.out.orders.push(Order::Anchor(self.measured_point())),
                 Wish::StopStream => self.out.orders.push(Order::Off),
+                Wish::ShiftWorld(by_m) => self.shift_world(by_m),
                 Wish::FlyBack => {
                     let from = report.map_or_else(|| self.measured_point(), |report| report.input);
                     let rest = rest_from(&self.way_back.waypoints(), from.position_m)

@@ -221,6 +221,46 @@ fn the_world_and_the_vehicle_stay_when_the_estimator_jumps() {
 }
 
 #[test]
+fn a_world_that_is_moved_takes_its_places_along_and_moves_no_vehicle() {
+    let mut rig = rig();
+    rig.take_off();
+    rig.target(1, &[at(1.0, 0.0, 3.0, 0.5, 0.0)]);
+    rig.until("arrived", 30, |rig| rig.state().target_status == TargetStatus::Arrived.code());
+    let (before, path) = (rig.state(), rig.path.len());
+    let shift = |rig: &mut Rig, shift_m: [f64; 3], reset_count: u32| {
+        let command = VehicleCommand::ShiftWorld.code();
+        rig.request_with(CommandRequest { command, reset_count, shift_m, ..CommandRequest::default() })
+    };
+    let id = shift(&mut rig, [1.5, -2.0, 0.5], before.reset_count);
+    rig.until("moved", 10, |rig| rig.status(id).0 == Some(CommandStatus::Confirmed));
+    rig.seconds(1);
+    let after = rig.state();
+    assert_eq!((after.reset_count, after.streaming), (before.reset_count + 1, 0));
+    let moved = DVec3::from_array(after.position_m) - DVec3::from_array(before.position_m);
+    assert!((moved - DVec3::new(1.5, -2.0, 0.5)).length() < 0.1, "{moved}");
+    let home = DVec3::from_array(after.home_m) - DVec3::from_array(before.home_m);
+    assert!((home - DVec3::new(1.5, -2.0, 0.5)).length() < 0.01, "{home}");
+    // What was measured before it moved does not hold any more, and what is far off is no shift.
+    for (by_m, reset_count, reason) in
+        [([1.0, 0.0, 0.0], before.reset_count, "moved since"), ([30.0, 0.0, 0.0], after.reset_count, "at most 20")]
+    {
+        let id = shift(&mut rig, by_m, reset_count);
+        rig.seconds(1);
+        let (status, why) = rig.status(id);
+        assert!(status == Some(CommandStatus::Refused) && why.contains(reason), "{status:?} {why}");
+    }
+    // The next life knows, and the vehicle goes on from where it stands.
+    rig.restart(20);
+    rig.until("known again", 20, |rig| rig.state().ready == 1);
+    assert_eq!(rig.state().reset_count, after.reset_count);
+    rig.command(VehicleCommand::TakeControl, 20);
+    let truly = rig.path[path..].windows(2).map(|pair| pair[0].distance(pair[1])).sum::<f64>();
+    assert!(truly < 0.5, "the vehicle went {truly} m");
+    rig.command(VehicleCommand::Return, 120);
+    assert_eq!(rig.state().landed, 1);
+}
+
+#[test]
 fn an_autopilot_that_would_climb_away_is_refused_with_the_way_out() {
     let mut rig = Rig::new(
         LinkConfig { set_params: Some(false), ..LinkConfig::default() },

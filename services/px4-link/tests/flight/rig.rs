@@ -116,14 +116,14 @@ impl Rig {
     }
 
     pub fn request(&mut self, command: VehicleCommand) -> u64 {
+        self.request_with(CommandRequest { command: command.code(), altitude_m: 2.5, ..CommandRequest::default() })
+    }
+
+    pub fn request_with(&mut self, request: CommandRequest) -> u64 {
         self.requests += 1;
         let address =
             ReplyAddress { client: 8, client_incarnation: 0, request_id: self.requests, sent_ns: self.now_ns };
-        self.core.on_command(
-            self.now_ns,
-            address,
-            &CommandRequest { command: command.code(), altitude_m: 2.5, reserved: 0 },
-        );
+        self.core.on_command(self.now_ns, address, &request);
         self.requests
     }
 
