@@ -235,7 +235,7 @@ fn completes(folder: &Path, what: &str) {
 
 #[test]
 fn folders_that_a_cut_left_are_measured_and_resumed() {
-    go_on_after_cuts(9);
+    go_on_after_cuts(14);
 }
 
 /// cargo test --release --test power_cuts -- --ignored --nocapture

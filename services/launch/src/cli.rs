@@ -24,10 +24,8 @@ pub enum Command {
     #[command(after_help = "Example: vantage fly --object statue.obj --preset quick --output statue --seed 7")]
     Fly(Fly),
     /// Go on with a mission that was cut off.
-    #[command(
-        after_help = "Example: vantage resume missions/20260801-120000-0\n         \
-        vantage resume missions/20260801-120000-0 --set trainer.backend=cpu"
-    )]
+    #[command(after_help = "Example: vantage resume missions/20260801-120000-0\n         \
+        vantage resume missions/20260801-120000-0 --set trainer.backend=cpu")]
     Resume(Resume),
     /// Show what runs, since when, restarts, memory and ages of the last messages.
     #[command(after_help = "Example: vantage status --json")]

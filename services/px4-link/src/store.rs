@@ -75,6 +75,9 @@ pub struct Kept {
     pub expected: FlightMode,
     /// The mode before that, until the commanded one was seen.
     pub before_expected: FlightMode,
+    /// Arming was commanded, or is waited for, and not yet seen: who finds the vehicle armed on the ground need not ask by
+    /// whom.
+    pub arming: bool,
     /// A flight of ours was not yet followed by Hold on the ground.
     pub flown: bool,
     /// The mission of the last target: ids count within a mission.
@@ -90,6 +93,7 @@ impl Default for Kept {
             ours: false,
             expected: FlightMode::Unknown,
             before_expected: FlightMode::Unknown,
+            arming: false,
             flown: false,
             mission: 0,
             last_target_id: 0,

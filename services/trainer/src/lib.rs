@@ -10,6 +10,7 @@ pub mod checkpoint;
 pub mod keyframes;
 pub mod logic;
 pub mod measure;
+pub mod memory;
 pub mod ports;
 pub mod requests;
 pub mod round;
@@ -97,6 +98,7 @@ impl Trainer {
         if config.mission.folder.is_empty() {
             bail!("mission.folder is empty; expected the mission folder's path (`vantage fly` fills it in)");
         }
+        memory::limit(config.trainer.memory_mb);
         let folder = MissionFolder::open(&config.mission.folder)?;
         let threads = match config.trainer.threads {
             0 => std::thread::available_parallelism().map_or(1, usize::from),
@@ -118,7 +120,11 @@ impl Trainer {
         } else {
             Pace::OnDemand
         };
-        let session = Session::new(config.trainer.clone(), config.model.clone(), training.into_backend());
+        let mut model = config.model.clone();
+        let last_exit = std::env::var(memory::LAST_EXIT).ok();
+        model.max_gaussians =
+            memory::most_gaussians(&model_folder, model.max_gaussians, last_exit.as_deref(), memory::kernel_kills());
+        let session = Session::new(config.trainer.clone(), model, training.into_backend());
         let worker = Worker::start(session, Box::new(folder), model_folder, config.trainer.slice_iterations, pace)
             .context("cannot start the training thread")?;
         Ok(Self {

@@ -474,6 +474,14 @@ impl Session {
         })
     }
 
+    /// Lets the least contributing go where there are more than the cap, which is lower after a death for memory.
+    pub(crate) fn hold_at_cap(&mut self) -> Result<(), BackendError> {
+        if self.model().len() <= self.model_config.max_gaussians as usize {
+            return Ok(());
+        }
+        self.append(Vec::new())
+    }
+
     pub(crate) fn reset(&mut self) {
         self.restore(Gaussians::new(), Optimiser::new(), Progression::new());
     }

@@ -64,6 +64,9 @@ pub struct TrainerConfig {
     pub iterations_per_s: DeclaredCost,
     /// Worker threads; 0: one per core.
     pub threads: u32,
+    /// Megabytes that the trainer may take for itself (shared memory does not count); 0: what there is. One that was killed
+    /// for its memory begins again with a smaller model.
+    pub memory_mb: u32,
     /// What trains: `"auto"` (a GPU where there is a real one, else the CPU), `"cpu"` or `"gpu"`.
     pub backend: BackendWord,
     /// Whether sums on a GPU have an order, so that training on the same adapter and driver repeats bit for bit; costs
@@ -154,6 +157,7 @@ impl Default for TrainerConfig {
         Self {
             iterations_per_s: DeclaredCost::Fixed(80.0),
             threads: 0,
+            memory_mb: 0,
             backend: BackendWord::Auto,
             deterministic: false,
             adapter: String::new(),
@@ -224,6 +228,7 @@ impl TrainerConfig {
         }
         let counts = [
             ("threads", self.threads, 0, 1024),
+            ("memory_mb", self.memory_mb, 0, 1 << 24),
             ("slice_iterations", self.slice_iterations, 1, 1000),
             ("flat_window", self.flat_window, 10, 10_000),
             ("lr_means_decay_iterations", self.lr_means_decay_iterations, 1, 10_000_000),

@@ -32,7 +32,7 @@ impl Starter {
         self.logs.join(format!("{service}.log"))
     }
 
-    fn start(&self, service: ServiceName) -> io::Result<Child> {
+    fn start(&self, service: ServiceName, last_end: Option<&String>) -> io::Result<Child> {
         fs::create_dir_all(&self.logs)?;
         let log = OpenOptions::new().create(true).append(true).open(self.log_path(service))?;
         let mut command = Command::new(&self.program);
@@ -50,6 +50,9 @@ impl Starter {
         if std::env::var_os("VANTAGE_LOG").is_none() {
             command.env("VANTAGE_LOG", &self.log_level);
         }
+        if let Some(end) = last_end {
+            command.env("VANTAGE_LAST_EXIT", end);
+        }
         command.spawn()
     }
 }
@@ -60,6 +63,8 @@ pub struct Children {
     starter: Starter,
     running: BTreeMap<ServiceName, Child>,
     in_the_air: bool,
+    /// How each ended last.
+    ends: BTreeMap<ServiceName, String>,
     /// Reports of hung services so far.
     examined: u32,
 }
@@ -68,7 +73,7 @@ impl Children {
     /// None yet.
     #[must_use]
     pub fn new(starter: Starter) -> Self {
-        Self { starter, running: BTreeMap::new(), in_the_air: false, examined: 0 }
+        Self { starter, running: BTreeMap::new(), in_the_air: false, ends: BTreeMap::new(), examined: 0 }
     }
 
     /// Starts a service.
@@ -76,7 +81,7 @@ impl Children {
     /// # Errors
     /// When the process cannot be made or its log cannot be opened.
     pub fn start(&mut self, service: ServiceName) -> io::Result<()> {
-        let child = self.starter.start(service)?;
+        let child = self.starter.start(service, self.ends.get(&service))?;
         self.running.insert(service, child);
         Ok(())
     }
@@ -117,8 +122,9 @@ impl Children {
                 ended.push((*service, status.code(), describe(status)));
             }
         }
-        for (service, ..) in &ended {
+        for (service, _, end) in &ended {
             self.running.remove(service);
+            self.ends.insert(*service, end.clone());
         }
         ended
     }
@@ -224,6 +230,17 @@ mod tests {
         assert_eq!(children.last_words(ServiceName::World).as_deref(), Some("why"));
         let log = fs::read_to_string(children.log_path(ServiceName::World)).expect("log");
         assert!(log.starts_with("world --supervised --system /sys\n"), "{log}");
+    }
+
+    #[test]
+    fn the_next_process_is_told_how_the_last_one_ended() {
+        let folder = tempfile::tempdir().expect("folder");
+        let mut children = Children::new(script(folder.path(), "echo last: $VANTAGE_LAST_EXIT; kill -ABRT $$"));
+        for expected in ["last:", "last: signal 6"] {
+            children.start(ServiceName::Trainer).expect("started");
+            assert_eq!(reap_one(&mut children).2, "signal 6");
+            assert_eq!(children.last_words(ServiceName::Trainer).as_deref(), Some(expected));
+        }
     }
 
     #[test]

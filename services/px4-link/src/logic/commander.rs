@@ -92,7 +92,9 @@ impl Core {
             );
             Found::LeaveTo(Commander::Failsafe)
         } else {
-            found_in_air(mode, intended, self.telemetry.charge, self.outside_fence(), self.kept.commanded(mode))
+            let armed_by_us = self.kept.arming && self.telemetry.landed == Some(true) && mode != FlightMode::Pilot;
+            let ours = armed_by_us || self.kept.commanded(mode);
+            found_in_air(mode, intended, self.telemetry.charge, self.outside_fence(), ours)
         };
         self.world.accept();
         tracing::info!(?found, %mode, %intended, "found the vehicle armed");
@@ -247,6 +249,7 @@ impl Core {
             kept.expected = self.expected;
             kept.before_expected = self.before_expected;
             kept.flown = self.flown;
+            kept.arming = self.running.as_ref().is_some_and(|running| running.procedure.command == VehicleCommand::Arm);
         }
         self.store.keep(&kept);
         self.kept = kept;

@@ -207,6 +207,10 @@ impl Core {
             }
         };
         self.running = Some(Running { procedure: Procedure::new(command, &stages), address });
+        if command == VehicleCommand::Arm {
+            // On disk before it is sent: a px4-link that dies now must know the armed vehicle for its own.
+            self.remember();
+        }
     }
 
     /// The world moves under a vehicle that stays where it is: everything that is known in the world moves along.

@@ -104,6 +104,29 @@ fn a_restart_amid_our_own_hold_or_takeoff_goes_on() {
 }
 
 #[test]
+fn a_restart_between_our_arming_and_its_being_seen_is_no_pilots() {
+    let mut armed = 0;
+    for ticks in [1, 2, 3, 4, 6, 10, 30] {
+        let mut rig = rig();
+        rig.until("ready", 60, |rig| rig.state().ready == 1 && rig.state().armable == 1);
+        rig.request(VehicleCommand::Arm);
+        (0..ticks).for_each(|_| rig.tick(true));
+        let sent = core::mem::take(&mut rig.pending);
+        rig.restart(0);
+        rig.pending = sent;
+        for _ in 0..300 {
+            rig.tick(false);
+            let state = rig.state();
+            if state.armed == 1 {
+                armed += 1;
+                assert_ne!(state.commander, Commander::Pilot.code(), "after {ticks} ticks");
+            }
+        }
+    }
+    assert!(armed > 0, "it was armed at least once");
+}
+
+#[test]
 fn a_hold_just_after_control_was_taken_is_an_operators() {
     let mut rig = rig();
     rig.take_off();
