@@ -114,8 +114,9 @@ fn a_restart_between_our_arming_and_its_being_seen_is_no_pilots() {
         let sent = core::mem::take(&mut rig.pending);
         rig.restart(0);
         rig.pending = sent;
-        for _ in 0..300 {
-            rig.tick(false);
+        (0..10).for_each(|_| rig.tick(false));
+        for _ in 0..800 {
+            rig.tick(true);
             let state = rig.state();
             if state.armed == 1 {
                 armed += 1;
