@@ -47,6 +47,17 @@ pub struct Asked {
     pub visited_m: Vec<[f64; 3]>,
 }
 
+/// The world, moved.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Shift {
+    /// Mission time of the decision.
+    pub at_ns: u64,
+    /// What positions in the world change by, metres.
+    pub shift_m: [f64; 3],
+    /// The vehicle's reset counter before it.
+    pub reset_count: u32,
+}
+
 /// A chosen batch.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Batch {
@@ -75,10 +86,8 @@ pub struct Ledger {
     pub prior_views: BTreeMap<u32, (u64, u64)>,
     /// When the world was last known to lie where the prior says.
     pub placed_ns: Option<u64>,
-    /// How the world is being moved, and the vehicle's reset counter before that.
-    pub shift: Option<([f64; 3], u32)>,
-    /// How often it was moved since it was last in place.
-    pub shifts: u32,
+    /// How the world was moved since it was last in place, in order.
+    pub shifts: Vec<Shift>,
     /// The prior, and the gimbal's limits that go with it.
     pub prior: Option<(Prior, [f64; 2])>,
     /// Keyframes, in the order of capture.
@@ -164,19 +173,16 @@ impl Ledger {
                 self.placed_ns = Some(entry.now_ns);
             }
             Record::Shift { shift_m, reset_count } => {
-                self.shift = Some((*shift_m, *reset_count));
-                self.shifts += 1;
+                self.shifts.push(Shift { at_ns: entry.now_ns, shift_m: *shift_m, reset_count: *reset_count });
                 self.forget_checks();
             }
             Record::Aligned { .. } => {
                 self.placed_ns = Some(entry.now_ns);
-                self.shift = None;
-                self.shifts = 0;
+                self.shifts.clear();
             }
             // Another try counts anew.
             Record::Misaligned { .. } => {
-                self.shift = None;
-                self.shifts = 0;
+                self.shifts.clear();
                 self.forget_checks();
             }
             Record::Round { round, views, max_iterations } => self.rounds.push(Round {

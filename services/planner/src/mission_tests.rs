@@ -241,6 +241,22 @@ fn after_a_reboot_the_world_is_found_again() {
 }
 
 #[test]
+fn a_flight_that_is_cut_off_while_the_world_is_looked_for_leaves_nothing_to_the_next() {
+    for after in [300, 900, 1200, 1500, 1800, 2400] {
+        let commands = BTreeMap::from([(6000, MissionCommand::Recall)]);
+        let (mut world, _) = fly(short(), Faults { commands, ..Faults::default() });
+        world.reboot(DVec3::new(1.5, 1.0, 0.7), rock());
+        let at = world.tick() + after;
+        // Brought down by px4-link, and started anew with yet another origin.
+        world.step_down_at(at);
+        world.fly(2000.0);
+        world.reboot(DVec3::new(-1.0, 0.8, -0.6), rock());
+        assert_eq!((world.fly(3000.0), world.keyframes()), (EndReason::Complete, 14), "{after}");
+        assert!(world.off_m.length() < 0.05, "still off by {} after {after}", world.off_m);
+    }
+}
+
+#[test]
 fn an_object_that_is_gone_or_another_is_refused_with_the_figure() {
     for scene in [Scene::default(), Scene::single(0.0, 0.0, DVec3::new(0.6, 2.4, 1.9))] {
         let commands = BTreeMap::from([(6000, MissionCommand::Recall)]);

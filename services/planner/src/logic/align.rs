@@ -1,10 +1,11 @@
 //! Where the world has gone since the prior was taken: the prior's views again, laid onto the stored ones.
 //!
 //! An estimator that was started anew has put its origin elsewhere, by metres; gravity still tells which way is down, and
-//! the compass where north is, so that what is looked for is a shift. Both clouds become surfels (the mean and normal of the
-//! points in a cell). A search over shifts of whole cells counts how many of the object's new surfels lie where stored ones
-//! are; point-to-plane iterations (Chen and Medioni 1992) on object and ground then find the rest. What is left between the
-//! object's surfaces says whether it is the same object in the same attitude.
+//! the compass where north is, so that what is looked for is a shift. First the highest point of every cell of the plan: over
+//! all shifts of whole cells, ever smaller ones, the heights are laid on the stored ones, and those of the object count most.
+//! Then both clouds become surfels (mean and normal of the points in a cell) and point-to-plane iterations (Chen and Medioni
+//! 1992) on object and ground find the rest; along surfaces that all face one way, the heights' edges hold them. What is left
+//! between the object's surfaces says whether it is the same object in the same attitude.
 
 use glam::{DMat3, DVec2, DVec3};
 

@@ -8,6 +8,7 @@ use shared_types::messages::{CommandRequest, KeyframeReason, VehicleCommand, Veh
 use super::Mission;
 use crate::io::Views;
 use crate::journal::Record;
+use crate::ledger::Shift;
 use crate::logic::align::{Fit, align};
 use crate::logic::depth::DepthView;
 use crate::state::State;
@@ -20,7 +21,7 @@ const MOST_RESIDUAL_M: f64 = 0.05;
 /// A start whose height differs by more than this from that of the mission's first takeoff is taken for the same ground.
 const LEVEL_M: f64 = 0.3;
 /// More shifts than this do not settle.
-const MOST_SHIFTS: u32 = 5;
+const MOST_SHIFTS: usize = 5;
 
 impl Mission {
     /// Whether positions in the world mean what they meant when the prior was made: it was in this flight, or the world was
@@ -36,17 +37,24 @@ impl Mission {
             return false;
         }
         let rise_m = first_m[2] - vehicle.home_m[2];
-        if rise_m.abs() <= LEVEL_M || self.ledger.shifts > 0 {
+        if rise_m.abs() <= LEVEL_M || self.shifts() > 0 {
             return true;
         }
         self.record(Record::Shift { shift_m: [0.0, 0.0, rise_m], reset_count: vehicle.reset_count });
         false
     }
 
+    /// How often the world was moved in this flight.
+    pub(super) fn shifts(&self) -> usize {
+        self.ledger.shifts.iter().filter(|shift| shift.at_ns >= self.setup.epoch_ns).count()
+    }
+
     /// Sees that a shift is carried out; false where none is under way. That the vehicle's counter is another one says that
     /// it was: px4-link does it once, and a planner that was started anew cannot do it twice.
     pub(super) fn shifting(&mut self, vehicle: &VehicleState) -> bool {
-        let Some((shift_m, reset_count)) = self.ledger.shift else { return false };
+        // What an earlier flight wanted moved was measured in that flight's world.
+        let last = self.ledger.shifts.last().filter(|shift| shift.at_ns >= self.setup.epoch_ns);
+        let Some(Shift { shift_m, reset_count, .. }) = last.copied() else { return false };
         if vehicle.reset_count != reset_count {
             return false;
         }
@@ -74,7 +82,7 @@ impl Mission {
             "the prior's views were laid onto the stored ones"
         );
         if shift_m > if has_side { FINE_M } else { ROUGH_M } {
-            if self.ledger.shifts >= MOST_SHIFTS {
+            if self.shifts() >= MOST_SHIFTS {
                 return self.misaligned(Some(fit.residual_m), "the world does not settle; is the estimator drifting?");
             }
             self.record(Record::Shift { shift_m: fit.shift_m.to_array(), reset_count: vehicle.reset_count });

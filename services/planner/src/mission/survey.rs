@@ -134,7 +134,7 @@ impl Mission {
     /// Another number in every flight, for every survey, and whenever the world has moved: the camera takes no image twice.
     fn survey_id(&self, reason: KeyframeReason, from_above: bool) -> u64 {
         let checks = matches!(reason, KeyframeReason::CheckOverhead | KeyframeReason::CheckSide);
-        let place = if checks { 500 + u64::from(self.ledger.shifts) * 2 } else { u64::from(self.ledger.scans) * 2 };
+        let place = if checks { 500 + self.shifts() as u64 * 2 } else { u64::from(self.ledger.scans) * 2 };
         PRIOR_IDS + self.setup.epoch_ns / NS_PER_S * 1000 + place + u64::from(!from_above)
     }
 
