@@ -13,6 +13,7 @@ pub fn monotonic_ns() -> u64 {
 
 /// The present date and time, UTC, as `20260801-120000`.
 #[must_use]
+#[expect(clippy::disallowed_methods, reason = "the name of a folder, that a person reads")]
 pub fn date_stamp() -> String {
     let seconds = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_secs());
     stamp_of(seconds)
