@@ -86,6 +86,8 @@ pub struct Ledger {
     pub prior_views: BTreeMap<u32, (u64, u64)>,
     /// When the world was last known to lie where the prior says.
     pub placed_ns: Option<u64>,
+    /// When the object was last found not to be as it was.
+    pub misaligned_ns: Option<u64>,
     /// How the world was moved since it was last in place, in order.
     pub shifts: Vec<Shift>,
     /// The prior, and the gimbal's limits that go with it.
@@ -129,10 +131,23 @@ impl Ledger {
     /// The state after a journal.
     #[must_use]
     pub fn replay(entries: &[Entry]) -> Self {
+        Self::replay_for(entries, 0)
+    }
+
+    /// The same for a flight that began at `epoch_ns`: what earlier ones measured before there was a prior is nowhere now.
+    #[must_use]
+    pub fn replay_for(entries: &[Entry], epoch_ns: u64) -> Self {
+        let (before, here) = entries.split_at(entries.partition_point(|entry| entry.now_ns < epoch_ns));
         let mut ledger = Self::default();
-        for entry in entries {
-            ledger.apply(entry);
+        before.iter().for_each(|entry| ledger.apply(entry));
+        if !before.is_empty() && ledger.prior.is_none() {
+            ledger.airborne = None;
+            ledger.survey_m = None;
+            ledger.scans = 0;
+            ledger.scanning = false;
+            ledger.prior_views.clear();
         }
+        here.iter().for_each(|entry| ledger.apply(entry));
         ledger
     }
 
@@ -180,9 +195,8 @@ impl Ledger {
                 self.placed_ns = Some(entry.now_ns);
                 self.shifts.clear();
             }
-            // Another try counts anew.
             Record::Misaligned { .. } => {
-                self.shifts.clear();
+                self.misaligned_ns = Some(entry.now_ns);
                 self.forget_checks();
             }
             Record::Round { round, views, max_iterations } => self.rounds.push(Round {

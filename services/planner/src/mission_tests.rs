@@ -257,6 +257,32 @@ fn a_flight_that_is_cut_off_while_the_world_is_looked_for_leaves_nothing_to_the_
 }
 
 #[test]
+fn whatever_was_under_way_when_the_first_flight_ended_the_next_completes() {
+    // Between batches, with scores asked for, before and after the prior.
+    for at in (500..9000).step_by(500) {
+        let commands = BTreeMap::from([(at, MissionCommand::Recall)]);
+        let (mut world, end) = fly(short(), Faults { commands, ..Faults::default() });
+        if end != EndReason::None {
+            break;
+        }
+        world.reboot(DVec3::new(0.9, -0.6, 0.4), rock());
+        assert_eq!((world.fly(3000.0), world.keyframes()), (EndReason::Complete, 14), "{at}");
+    }
+}
+
+#[test]
+fn a_planner_that_dies_on_the_way_home_of_a_refusal_does_not_search_again() {
+    let commands = BTreeMap::from([(6000, MissionCommand::Recall)]);
+    let (mut world, _) = fly(short(), Faults { commands, ..Faults::default() });
+    world.reboot(DVec3::new(0.5, 0.3, 0.0), Scene::default());
+    world.fly_until(|entry| matches!(entry.record, Record::Misaligned { .. }));
+    world.resume();
+    assert_eq!(world.fly(2000.0), EndReason::Misaligned);
+    let refusals = world.journal.iter().filter(|entry| matches!(entry.record, Record::Misaligned { .. })).count();
+    assert_eq!(refusals, 1);
+}
+
+#[test]
 fn an_object_that_is_gone_or_another_is_refused_with_the_figure() {
     for scene in [Scene::default(), Scene::single(0.0, 0.0, DVec3::new(0.6, 2.4, 1.9))] {
         let commands = BTreeMap::from([(6000, MissionCommand::Recall)]);

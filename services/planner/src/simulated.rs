@@ -198,6 +198,15 @@ impl World {
         }
     }
 
+    /// Flies until the journal's last entry is such a one.
+    pub fn fly_until(&mut self, is_it: impl Fn(&Entry) -> bool) {
+        let end = self.tick + 100_000;
+        while !self.journal.last().is_some_and(&is_it) {
+            assert!(self.tick < end, "no such entry");
+            self.step();
+        }
+    }
+
     /// Another planner for the same folder: its journal is all that it knows.
     pub fn resume(&mut self) {
         self.mission = Some(Mission::new(self.setup.clone(), &self.journal));

@@ -6,6 +6,7 @@ use glam::DVec3;
 use shared_types::messages::{CommandRequest, KeyframeReason, VehicleCommand, VehicleState};
 
 use super::Mission;
+use super::vehicle::MOST_REFUSALS;
 use crate::io::Views;
 use crate::journal::Record;
 use crate::ledger::Shift;
@@ -20,6 +21,8 @@ const FINE_M: f64 = 0.02;
 const MOST_RESIDUAL_M: f64 = 0.05;
 /// A start whose height differs by more than this from that of the mission's first takeoff is taken for the same ground.
 const LEVEL_M: f64 = 0.3;
+/// A height that differs by more is no estimator's error, metres.
+const MOST_RISE_M: f64 = 15.0;
 /// More shifts than this do not settle.
 const MOST_SHIFTS: usize = 5;
 
@@ -37,8 +40,13 @@ impl Mission {
             return false;
         }
         let rise_m = first_m[2] - vehicle.home_m[2];
-        if rise_m.abs() <= LEVEL_M || self.shifts() > 0 {
+        if rise_m.abs() <= LEVEL_M {
             return true;
+        }
+        if self.shifts() >= MOST_SHIFTS || rise_m.abs() > MOST_RISE_M {
+            let why = format!("home is {:.1} m off the height of the first takeoff, and that is not mended", -rise_m);
+            self.misaligned(None, &why);
+            return false;
         }
         self.record(Record::Shift { shift_m: [0.0, 0.0, rise_m], reset_count: vehicle.reset_count });
         false
@@ -59,8 +67,14 @@ impl Mission {
             return false;
         }
         let command = VehicleCommand::ShiftWorld.code();
-        // Refused or not, the counter tells; a refusal rests for a while.
-        let _answer = self.ensure_request(CommandRequest { command, reset_count, altitude_m: 0.0, shift_m });
+        let answer = self.ensure_request(CommandRequest { command, reset_count, altitude_m: 0.0, shift_m });
+        // Done or not, the counter tells; a refusal rests for a while.
+        if let Some(Err(why)) = answer
+            && self.refusals >= MOST_REFUSALS
+        {
+            self.refusals = 0;
+            self.misaligned(None, &format!("the world cannot be moved: {why}"));
+        }
         true
     }
 

@@ -34,6 +34,9 @@ use crate::state::State;
 /// Ids of prior views begin here: no keyframe has them.
 pub const PRIOR_IDS: u64 = 1_000_000;
 
+/// A home that moved by less is the same, metres.
+const SAME_HOME_M: f64 = 0.01;
+
 /// What a mission is given once.
 #[derive(Debug, Clone)]
 pub struct Setup {
@@ -67,8 +70,6 @@ struct Pending {
 struct Terrain {
     survey_m: DVec3,
     home_m: DVec3,
-    /// The vehicle's, when this was made.
-    reset_count: u32,
     space: FreeSpace,
     roadmap: Roadmap,
     candidates: Candidates,
@@ -117,7 +118,8 @@ impl Mission {
     /// A mission that goes on after these entries of its journal; a new one after none.
     #[must_use]
     pub fn new(setup: Setup, entries: &[Entry]) -> Self {
-        let ledger = Ledger::replay(entries);
+        let ledger = Ledger::replay_for(entries, setup.epoch_ns);
+        let misaligned = ledger.misaligned_ns.is_some_and(|at_ns| at_ns >= setup.epoch_ns);
         let state = if ledger.over.is_some() {
             State::Over
         } else if ledger.started_ns.is_none() {
@@ -156,10 +158,10 @@ impl Mission {
             round_sent: None,
             score_sent: None,
             trainer_failed: false,
-            recalled: false,
+            recalled: misaligned,
             stepping_down: false,
             cancelled: false,
-            misaligned: false,
+            misaligned,
             published: None,
             sequence: 0,
             out: Outputs::default(),
@@ -434,14 +436,18 @@ impl Mission {
     fn ensure_terrain(&mut self) {
         let Some((_, home_m)) = self.ledger.airborne else { return };
         let placed = self.is_placed();
-        let reset_count = self.vehicle.map_or(0, |vehicle| vehicle.reset_count);
-        // A world that is being looked for takes everything along when it moves.
-        if self.terrain.as_ref().is_some_and(|terrain| placed || terrain.reset_count == reset_count) {
+        // In a world that is not yet found again nothing is where it was: neither the object nor where this began.
+        let home_m = match self.vehicle.filter(|vehicle| vehicle.ready == 1) {
+            _ if placed => home_m,
+            Some(vehicle) => vehicle.home_m,
+            None => return,
+        };
+        // And when it moves, everything moves.
+        let stays = |terrain: &Terrain| placed || terrain.home_m.distance(DVec3::from_array(home_m)) < SAME_HOME_M;
+        if self.terrain.as_ref().is_some_and(stays) {
             return;
         }
         let config = &self.setup.planner;
-        // In a world that is not yet found again nothing is where it was: neither the object nor where this began.
-        let home_m = self.vehicle.filter(|_| !placed).map_or(home_m, |vehicle| vehicle.home_m);
         let (survey_m, home_m) = (self.survey_m(), DVec3::from_array(home_m));
         let volume = Volume::of_mission(survey_m, home_m, config);
         let (space, candidates) = match self.ledger.prior.as_ref().filter(|_| placed) {
@@ -454,7 +460,7 @@ impl Mission {
             }
         };
         let roadmap = Roadmap::new(&space);
-        self.terrain = Some(Terrain { survey_m, home_m, reset_count, space, roadmap, candidates });
+        self.terrain = Some(Terrain { survey_m, home_m, space, roadmap, candidates });
     }
 
     /// The terrain anew after the prior or the survey point changed; what was seen is kept where the volume is the same.

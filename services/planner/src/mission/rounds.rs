@@ -33,6 +33,9 @@ impl Mission {
         }
         self.ask_for_round();
         self.choose_batch();
+        if !self.is_placed() {
+            self.progress_ns = self.now_ns;
+        }
         let waiting =
             self.ledger.asked.is_some() || (self.ledger.training().is_some() && self.state == State::Deciding);
         let late = self.now_ns > self.progress_ns.saturating_add(ns_from_s(self.setup.planner.service_deadline_s));
@@ -137,7 +140,8 @@ impl Mission {
 
     fn choose_batch(&mut self) {
         let Some((prior, limits)) = self.ledger.prior else { return };
-        if self.homeward() {
+        // In a world that is not found again there are no candidates yet.
+        if self.homeward() || !self.is_placed() {
             return;
         }
         self.ensure_terrain();

@@ -19,7 +19,7 @@ const LINK_QUIET_NS: u64 = 500_000_000;
 /// How long a failsafe may stay without a reason, nanoseconds.
 const UNEXPLAINED_NS: u64 = 3_000_000_000;
 /// Refusals after which a command is not tried again.
-const MOST_REFUSALS: u32 = 3;
+pub(super) const MOST_REFUSALS: u32 = 3;
 
 impl Mission {
     pub(super) fn heard(&mut self, vehicle: VehicleState) {

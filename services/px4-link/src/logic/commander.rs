@@ -241,6 +241,17 @@ impl Core {
         (far_m > 0.0 && from_home_m.truncate().length() > far_m - 0.2) || (high_m > 0.0 && from_home_m.z > high_m - 0.2)
     }
 
+    fn is_arming(&self) -> bool {
+        self.running.as_ref().is_some_and(|running| running.procedure.command == VehicleCommand::Arm)
+    }
+
+    /// An arming of ours that is over, done or not, explains no armed vehicle any more.
+    pub(super) fn forget_arming(&mut self) {
+        if self.kept.arming && !self.first_sight && !self.is_arming() {
+            self.remember();
+        }
+    }
+
     pub(super) fn remember(&mut self) {
         let mut kept = Kept { transform: self.world.kept(), ..self.kept.clone() };
         // Before the vehicle was looked at, what an earlier life knew of the flight still counts.
@@ -249,7 +260,7 @@ impl Core {
             kept.expected = self.expected;
             kept.before_expected = self.before_expected;
             kept.flown = self.flown;
-            kept.arming = self.running.as_ref().is_some_and(|running| running.procedure.command == VehicleCommand::Arm);
+            kept.arming = self.is_arming();
         }
         self.store.keep(&kept);
         self.kept = kept;

@@ -305,6 +305,7 @@ impl Core {
             self.mind_the_planner(now_ns);
             self.run_procedure(now_ns);
         }
+        self.forget_arming();
         if self.telemetry.position_stamp_ns > 0 {
             self.out.orders.push(Order::Measured {
                 position_m: self.telemetry.position_m,

@@ -217,11 +217,13 @@ impl Core {
     fn shift_world(&mut self, by_m: DVec3) {
         tracing::info!(?by_m, "the world is moved");
         self.out.orders.push(Order::Off);
+        // A death in between leaves no way back of the other world: the autopilot's own return is left then.
+        self.store.keep_way_back(&WayBack::default());
         self.world.shift(by_m);
         self.telemetry.position_m += by_m;
+        self.remember();
         self.way_back.shift(by_m);
         self.store.keep_way_back(&self.way_back);
-        self.remember();
     }
 
     pub(super) fn answer(&mut self, address: ReplyAddress, reply: CommandReply) {
