@@ -20,6 +20,8 @@ use crate::rig::{Rig, at, rig};
 const LARGEST_STEP_M: f64 = 0.3;
 /// A stream is fresh when its last setpoint is no older, ticks.
 const FRESH_TICKS: u64 = 10;
+/// Absences up to this long are none, ticks.
+const QUIET_TICKS: u64 = 50;
 /// Gap between setpoints after which they are a new stream, ticks.
 const GAP_TICKS: u64 = 50;
 /// A jump of the estimate is told within this time, ticks: ODOMETRY comes 30 times a second.
@@ -93,6 +95,8 @@ struct Model {
     jumped_at: Option<u64>,
     /// The link was silent until this tick: what was streamed meanwhile was not seen.
     back_at: Option<u64>,
+    /// End of the last absence that was too short to count.
+    stalled_at: Option<u64>,
     /// A pilot commanded a mode at this tick, and nobody said go on since.
     pilot_since: Option<u64>,
 }
@@ -111,6 +115,7 @@ impl Model {
             anchor: None,
             jumped_at: None,
             back_at: None,
+            stalled_at: None,
             pilot_since: None,
         }
     }
@@ -179,7 +184,7 @@ impl Model {
             {
                 let age = self.last.map(|(tick, _)| self.tick - tick);
                 let unseen = self.jumped_at.is_some_and(|tick| self.tick <= tick + TOLD_TICKS + FRESH_TICKS)
-                    || self.back_at.is_some_and(|tick| self.tick <= tick + FRESH_TICKS);
+                    || self.back_at.max(self.stalled_at).is_some_and(|tick| self.tick <= tick + FRESH_TICKS);
                 prop_assert!(
                     unseen || age.is_some_and(|age| age <= FRESH_TICKS),
                     "tick {}: OFFBOARD without a fresh stream (last setpoint {age:?} ticks ago)",
@@ -233,6 +238,10 @@ impl Model {
             Chance::Stall(ticks) => {
                 // In lockstep the clock tells a member that it was out; a shorter absence is its own to notice.
                 self.ticks(ticks, false)?;
+                if u64::from(ticks) <= QUIET_TICKS {
+                    // px4-link takes it for none, and the autopilot waits longer for setpoints.
+                    self.stalled_at = Some(self.tick);
+                }
                 if ticks > 200 {
                     self.rig.core.rejoin(self.rig.now_ns);
                     self.anew();
