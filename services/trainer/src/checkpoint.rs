@@ -68,6 +68,12 @@ impl Checkpoint {
         self.progression.finished.last().map(|round| &round.spec)
     }
 
+    /// Gaussians in its model.
+    #[must_use]
+    pub fn gaussians(&self) -> usize {
+        self.model.len()
+    }
+
     /// Puts the session where the checkpoint was taken. The caller then reads the keyframes
     /// ([`Session::resume`]).
     pub fn restore_into(self, session: &mut Session) {

@@ -122,8 +122,13 @@ impl Trainer {
         };
         let mut model = config.model.clone();
         let last_exit = std::env::var(memory::LAST_EXIT).ok();
-        model.max_gaussians =
-            memory::most_gaussians(&model_folder, model.max_gaussians, last_exit.as_deref(), memory::kernel_kills());
+        model.max_gaussians = memory::most_gaussians(
+            &model_folder,
+            model.max_gaussians,
+            last_exit.as_deref(),
+            memory::kernel_kills(),
+            || checkpoint::newest(&model_folder, false).map(|newest| newest.gaussians()),
+        );
         let session = Session::new(config.trainer.clone(), model, training.into_backend());
         let worker = Worker::start(session, Box::new(folder), model_folder, config.trainer.slice_iterations, pace)
             .context("cannot start the training thread")?;

@@ -1,8 +1,8 @@
 //! How many Gaussians memory has room for.
 //!
-//! Who is killed for its memory would be killed again by the same model. The trainer remembers in `model/memory.json` how
-//! large the model was when it last grew; where its supervisor says that the last process was killed, and it was for memory,
-//! the next one keeps three quarters of that at most, and says so.
+//! Who is killed for its memory would be killed again by the same model. Where the supervisor says that the last process was
+//! killed, and it was for memory, the next one keeps three quarters of what the newest checkpoint holds at most, remembers
+//! that in `model/memory.json`, and says so.
 
 use std::path::Path;
 
@@ -25,8 +25,6 @@ pub struct Record {
     pub deaths: u32,
     /// Most Gaussians after that.
     pub most: Option<u64>,
-    /// Gaussians when the model last grew.
-    pub gaussians: u64,
     /// The kernel's count of processes that it killed for memory, when this trainer began.
     pub kernel_kills: u64,
 }
@@ -59,9 +57,16 @@ pub fn kernel_kills() -> u64 {
         .unwrap_or(0)
 }
 
-/// Most Gaussians, of `most` that are configured: fewer where the last trainer died of them.
+/// Most Gaussians, of `most` that are configured: fewer where the last trainer died of them. `held` gives how many the newest
+/// checkpoint holds.
 #[must_use]
-pub fn most_gaussians(model_folder: &Path, most: u32, last_exit: Option<&str>, kernel_kills: u64) -> u32 {
+pub fn most_gaussians(
+    model_folder: &Path,
+    most: u32,
+    last_exit: Option<&str>,
+    kernel_kills: u64,
+    held: impl FnOnce() -> Option<usize>,
+) -> u32 {
     let mut record = Record::read(model_folder);
     // An allocation that the system refuses ends the process by SIGABRT; the kernel's own choice is SIGKILL.
     let for_memory = match last_exit {
@@ -69,13 +74,15 @@ pub fn most_gaussians(model_folder: &Path, most: u32, last_exit: Option<&str>, k
         Some("signal 9") => kernel_kills > record.kernel_kills,
         _ => false,
     };
-    if for_memory && record.gaussians > 0 {
-        let before = record.most.unwrap_or(u64::MAX).min(record.gaussians).min(u64::from(most));
+    if for_memory {
+        // Before the first checkpoint nobody knows how many there were.
+        let held = held().map_or(u64::MAX, |count| count as u64);
+        let before = record.most.unwrap_or(u64::MAX).min(held).min(u64::from(most));
         let now = (before * 3 / 4).max(LEAST.min(before));
         record.deaths += 1;
         record.most = Some(now);
         tracing::warn!(
-            gaussians = record.gaussians,
+            before,
             most = now,
             "the last trainer was killed for its memory: the model is held smaller; trainer.memory_mb or model.max_gaussians say more"
         );
@@ -85,15 +92,6 @@ pub fn most_gaussians(model_folder: &Path, most: u32, last_exit: Option<&str>, k
         record.write(model_folder);
     }
     record.most.map_or(most, |limit| u32::try_from(limit).unwrap_or(most).min(most))
-}
-
-/// Remembers that the model is to grow.
-pub(crate) fn note(model_folder: &Path, gaussians: usize) {
-    let mut record = Record::read(model_folder);
-    if record.gaussians != gaussians as u64 {
-        record.gaussians = gaussians as u64;
-        record.write(model_folder);
-    }
 }
 
 /// Lets this process have so many megabytes of its own (shared memory does not count); 0 lets it have what there is.
@@ -115,22 +113,25 @@ mod tests {
     #[test]
     fn a_trainer_killed_for_memory_holds_the_model_smaller_and_one_killed_otherwise_does_not() {
         let folder = tempfile::tempdir().unwrap();
-        let most = |last_exit, kills| most_gaussians(folder.path(), 100_000, last_exit, kills);
-        assert_eq!(most(Some("signal 6"), 3), 100_000, "nothing was trained yet");
-        note(folder.path(), 40_000);
+        let most = |last_exit, kills, held| most_gaussians(folder.path(), 100_000, last_exit, kills, || held);
         for (last_exit, kills) in [(None, 3), (Some("signal 9"), 3), (Some("exit code 70"), 3), (Some("signal 15"), 4)]
         {
-            assert_eq!(most(last_exit, kills), 100_000, "{last_exit:?}");
+            assert_eq!(most(last_exit, kills, Some(40_000)), 100_000, "{last_exit:?}");
         }
-        assert_eq!(most(Some("signal 9"), 5), 30_000, "the kernel killed somebody since");
-        assert_eq!(most(Some("signal 9"), 5), 30_000, "but not again");
-        note(folder.path(), 30_000);
-        assert_eq!(most(Some("signal 6"), 5), 22_500);
+        assert_eq!(most(Some("signal 9"), 5, Some(40_000)), 30_000, "the kernel killed somebody since");
+        assert_eq!(most(Some("signal 9"), 5, Some(40_000)), 30_000, "but not again");
+        assert_eq!(most(Some("signal 6"), 5, Some(30_000)), 22_500);
         assert_eq!(Record::read(folder.path()).deaths, 2);
         // However often: what shows nothing helps nobody.
         for _ in 0..40 {
-            most(Some("signal 6"), 5);
+            most(Some("signal 6"), 5, None);
         }
-        assert_eq!(most(None, 5), 500);
+        assert_eq!(most(None, 5, None), 500);
+    }
+
+    #[test]
+    fn one_that_died_before_its_first_checkpoint_begins_with_less_room() {
+        let folder = tempfile::tempdir().unwrap();
+        assert_eq!(most_gaussians(folder.path(), 100_000, Some("signal 6"), 0, || None), 75_000);
     }
 }

@@ -18,7 +18,6 @@ use splatting::BackendError;
 use crate::backend;
 use crate::checkpoint;
 use crate::keyframes::KeyframeSource;
-use crate::memory;
 use crate::round::{FinishedRound, Progress, RoundSpec};
 use crate::session::{Session, SessionError, Snapshot};
 
@@ -336,15 +335,6 @@ impl Thread {
     }
 
     fn begin(&mut self, spec: RoundSpec) -> Result<(), SessionError> {
-        let begun = self.begin_round(spec);
-        if begun.is_ok() {
-            // From here on the optimiser, the checkpoint and the snapshots of so many have to fit.
-            memory::note(&self.model_folder, self.session.model().len());
-        }
-        begun
-    }
-
-    fn begin_round(&mut self, spec: RoundSpec) -> Result<(), SessionError> {
         match self.session.active() {
             Some(active) if *active == spec => {
                 self.session.resume(&mut *self.source)?;
