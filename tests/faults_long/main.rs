@@ -12,9 +12,11 @@
 #[path = "../common/mod.rs"]
 mod common;
 mod judge;
+mod load;
 mod mission;
 mod phase;
 mod record;
+mod starts;
 mod table;
 
 use std::path::PathBuf;
@@ -41,6 +43,7 @@ enum Blow {
 #[command(after_help = "Examples:\n  \
     cargo test --release --test faults_long -- --missions 200 --kills 5\n  \
     cargo test --release --test faults_long -- --blow stop --stop-s 2 --set clock.mode=wall --out target/stops\n  \
+    cargo test --release --test faults_long -- --starts 2000\n  \
     cargo test --release --test faults_long -- --at-once 2 --baseline target/undisturbed --vary-seed --out target/pairs")]
 struct Options {
     /// Missions in all, those of the file included.
@@ -85,6 +88,9 @@ struct Options {
     /// Longest wall time of a fault behind the beginning of the phase that is drawn for it, milliseconds; the least is 0.
     #[arg(long, default_value_t = 200)]
     pause_ms: u64,
+    /// No missions: starts services beside a keeper, so often in all, and kills most of them while they start.
+    #[arg(long, value_name = "CYCLES")]
+    starts: Option<u64>,
     /// Where results go.
     #[arg(long, default_value = "target/faults")]
     out: PathBuf,
@@ -92,6 +98,9 @@ struct Options {
 
 fn main() -> ExitCode {
     let options = Options::parse();
+    if let Some(cycles) = options.starts {
+        return if starts::storm(cycles, options.seed, &options.out) { ExitCode::SUCCESS } else { ExitCode::FAILURE };
+    }
     let mut results = Results::open(&options.out);
     let began = Instant::now();
     let done_before = results.missions.len() as u64;

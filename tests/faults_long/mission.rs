@@ -8,6 +8,7 @@ use splatting::order::Random;
 use crate::common::watch::{Moment, Watch};
 use crate::common::{Flight, kill, runs, system_files, vantage};
 use crate::judge::judge;
+use crate::load::{self, Loads, Meter};
 use crate::record::{Fault, Flown, Mission};
 use crate::{Blow, Options, phase};
 
@@ -30,6 +31,9 @@ struct Flying<'a> {
     folder: &'a Path,
     /// `None` while launch is dead.
     flight: Option<(Flight, Watch)>,
+    /// Of the launch that lives.
+    meter: Option<Meter>,
+    loads: Loads,
     faults: Vec<Fault>,
     largest_step_m: f64,
     error: String,
@@ -45,12 +49,15 @@ pub fn fly(options: &Options, index: u64) -> Flown {
     let seed = if options.vary_seed { SEED + index } else { SEED };
     let flight = start(options, &folder, seed);
     let watch = Watch::begin(flight.pid());
+    let meter = Some(Meter::begin(flight.pid()));
     let mut flying = Flying {
         options,
         index,
         seed,
         folder: &folder,
         flight: Some((flight, watch)),
+        meter,
+        loads: Loads::new(),
         faults: Vec::new(),
         largest_step_m: 0.0,
         error: String::new(),
@@ -172,10 +179,14 @@ impl Flying<'_> {
             start(self.options, self.folder, self.seed)
         };
         let watch = Watch::begin(flight.pid());
+        self.meter = Some(Meter::begin(flight.pid()));
         self.flight = Some((flight, watch));
     }
 
     fn take_notes(&mut self) {
+        if let Some(meter) = self.meter.take() {
+            load::merge(&mut self.loads, meter.end());
+        }
         if let Some((_, watch)) = &self.flight {
             self.largest_step_m = self.largest_step_m.max(watch.look(|heard| heard.largest_step_m));
         }
@@ -185,6 +196,9 @@ impl Flying<'_> {
         if let Some((flight, watch)) = self.flight.take() {
             let terminal = self.folder.with_extension("terminal.log");
             let status = flight.finish();
+            if let Some(meter) = self.meter.take() {
+                load::merge(&mut self.loads, meter.end());
+            }
             self.largest_step_m = self.largest_step_m.max(watch.look(|heard| heard.largest_step_m));
             if !status.success() {
                 let text = std::fs::read_to_string(terminal).unwrap_or_default();
@@ -203,6 +217,8 @@ impl Flying<'_> {
             collisions: 0,
             leftovers: system_files().into_iter().filter(|path| !before.contains(path)).count(),
             wall_s: began.elapsed().as_secs_f64(),
+            loads: core::mem::take(&mut self.loads),
+            shared_memory_bytes: load::shared_memory_bytes(),
             error: core::mem::take(&mut self.error),
         };
         judge(&mut mission, self.folder);

@@ -6,6 +6,8 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
+use crate::load::Loads;
+
 /// No setpoint is farther from the one before.
 const LARGEST_STEP_M: f64 = 0.3;
 /// Radius of the vehicle and the error of an exact estimator: what the path planner's clearance is made of, without its
@@ -63,6 +65,12 @@ pub struct Mission {
     pub leftovers: usize,
     /// Wall time.
     pub wall_s: f64,
+    /// The most that each process held, by name.
+    #[serde(default)]
+    pub loads: Loads,
+    /// Bytes in use in `/dev/shm` after it.
+    #[serde(default)]
+    pub shared_memory_bytes: u64,
     /// What went wrong otherwise; empty where nothing did.
     pub error: String,
 }

@@ -3,6 +3,7 @@
 use std::collections::BTreeSet;
 use std::fmt::Write as _;
 
+use crate::load::Load;
 use crate::phase::PHASES;
 use crate::record::{Fault, Mission, Results};
 
@@ -49,12 +50,52 @@ pub fn table(results: &Results, baseline: Option<&Results>) -> String {
         writeln!(text, "px4-link flies by setpoints again after {ms:.0} ms (median)").ok();
     }
     text += &psnr(missions, baseline);
+    text += &loads(missions);
     let clearance = missions.iter().filter_map(|mission| mission.clearance_m).fold(f64::INFINITY, f64::min);
     if clearance.is_finite() {
         writeln!(text, "least clearance {clearance:.2} m").ok();
     }
     let step = missions.iter().map(|mission| mission.largest_step_m).fold(0.0, f64::max);
     writeln!(text, "longest way between two setpoints {step:.3} m").ok();
+    text
+}
+
+/// What processes held in the first fifth of the missions, and in the last: medians of what each had at most.
+fn loads(missions: &[Mission]) -> String {
+    let share = missions.len() / 5;
+    if share == 0 {
+        return String::new();
+    }
+    let (first, last) = (&missions[..share], &missions[missions.len() - share..]);
+    let names: BTreeSet<&str> = missions.iter().flat_map(|mission| mission.loads.keys().map(String::as_str)).collect();
+    let mut text = format!(
+        "\nWhat processes held at most, median of the first and of the last {share} missions:\n\n\
+         | process | descriptors | maps | threads | resident MB |\n|---|---|---|---|---|\n"
+    );
+    for name in names {
+        let of = |these: &[Mission], figure: fn(&Load) -> u64| {
+            words(median(these.iter().filter_map(|mission| Some(figure(mission.loads.get(name)?) as f64)).collect()))
+        };
+        let both = |figure: fn(&Load) -> u64| format!("{} -> {}", of(first, figure), of(last, figure));
+        writeln!(
+            text,
+            "| {name} | {} | {} | {} | {} |",
+            both(|load| load.fds),
+            both(|load| load.maps),
+            both(|load| load.threads),
+            both(|load| load.rss_kb / 1024)
+        )
+        .ok();
+    }
+    let shm = |these: &[Mission]| these.iter().map(|mission| mission.shared_memory_bytes).max().unwrap_or(0);
+    let wall_min = missions.iter().map(|mission| mission.wall_s).sum::<f64>() / 60.0;
+    writeln!(
+        text,
+        "\n/dev/shm after a mission, at most: {} -> {} bytes; {wall_min:.0} minutes of missions",
+        shm(first),
+        shm(last)
+    )
+    .ok();
     text
 }
 

@@ -325,7 +325,8 @@ fn a_mission_told_to_end_before_it_began_is_over_and_may_be_begun_later() {
 
 #[test]
 fn a_pilot_is_waited_for() {
-    let (world, end) = fly(short(), Faults { pilot: Some(5000), ..Faults::default() });
+    let (pilots, commands) = (BTreeMap::from([(5000, 500)]), BTreeMap::from([(5500, MissionCommand::GoOn)]));
+    let (world, end) = fly(short(), Faults { pilots, commands, ..Faults::default() });
     assert_eq!((end, world.keyframes()), (EndReason::Complete, 14));
     assert!(world.journal.iter().any(|entry| entry.record == Record::Suspended));
 }
@@ -364,6 +365,16 @@ fn a_planner_that_dies_between_touchdown_and_disarming_waits_for_the_disarming()
     }
 }
 
+fn an_order() -> impl proptest::strategy::Strategy<Value = MissionCommand> {
+    proptest::sample::select(vec![
+        MissionCommand::Stop,
+        MissionCommand::Abort,
+        MissionCommand::Land,
+        MissionCommand::GoOn,
+        MissionCommand::Recall,
+    ])
+}
+
 proptest::proptest! {
     #![proptest_config(proptest::test_runner::Config::with_cases(24))]
     #[test]
@@ -387,5 +398,43 @@ proptest::proptest! {
             _ => None,
         }).collect();
         proptest::prop_assert_eq!(ids.len(), 14 + 2);
+    }
+    /// Always a way to the ground: an operator says anything at any time, a pilot comes and goes, processes die; when the
+    /// pilot has let go and the operator says go on, and stop, it lands. A mission that is still open then is resumed.
+    #[test]
+    fn whatever_operator_and_pilot_do_it_lands_with_every_keyframe_once(
+        said in proptest::collection::btree_map(100u64..12_000, an_order(), 0..6),
+        pilots in proptest::collection::btree_map(1500u64..12_000, 20u64..900, 0..3),
+        deaths in proptest::collection::btree_map(50u64..13_000, 1u64..400, 0..3),
+        link in proptest::collection::btree_set(1500u64..13_000, 0..3),
+    ) {
+        let mut commands = said;
+        for at in (13_000..400_000).step_by(800) {
+            commands.insert(at, MissionCommand::GoOn);
+            commands.insert(at + 400, MissionCommand::Stop);
+        }
+        let faults = Faults { restarts: deaths, link_restarts: link, pilots, commands, ..Faults::default() };
+        let mut world = World::new(setup(short(), 7), rock(), faults);
+        let is_over = |world: &World| world.journal.iter().any(|entry| matches!(entry.record, Record::Over { .. }));
+        for _ in 0..8 {
+            world.fly(3000.0);
+            if is_over(&world) {
+                break;
+            }
+            world.resume();
+        }
+        proptest::prop_assert!(is_over(&world), "open after all: {:?}", world.journal.last());
+        proptest::prop_assert!(world.captures.values().all(|&count| count == 1));
+        proptest::prop_assert!(world.least_clearance_m >= 0.72, "{}", world.least_clearance_m);
+        let mut ended = false;
+        for entry in &world.journal {
+            ended |= matches!(entry.record, Record::Ending { .. });
+            proptest::prop_assert!(!ended || !matches!(entry.record, Record::Selected { .. }), "chosen after the end");
+        }
+        let ids: Vec<u64> = world.journal.iter().filter_map(|entry| match &entry.record {
+            Record::Captured { keyframe_id, .. } => Some(*keyframe_id),
+            _ => None,
+        }).collect();
+        proptest::prop_assert_eq!(ids.iter().collect::<BTreeSet<_>>().len(), ids.len(), "twice in the journal");
     }
 }

@@ -42,8 +42,9 @@ pub struct Faults {
     pub drain_per_s: f64,
     /// Commands from outside, by tick.
     pub commands: BTreeMap<u64, MissionCommand>,
-    /// A pilot takes over at this tick and lets go 5 s later.
-    pub pilot: Option<u64>,
+    /// A pilot takes over at these ticks, where the vehicle flies, and lets go after so many; until the operator says go on,
+    /// the vehicle takes no orders.
+    pub pilots: BTreeMap<u64, u64>,
     /// The scorer says that the snapshot is gone, the first time.
     pub generation_gone: bool,
     /// A lasting obstacle that only the small depth images show.
@@ -79,6 +80,7 @@ pub struct World {
     faults: Faults,
     dead_until: u64,
     link_back: u64,
+    pilot_until: u64,
     capture_count: u64,
     gone_said: bool,
     pub state: Option<MissionState>,
@@ -141,6 +143,7 @@ impl World {
             faults,
             dead_until: 0,
             link_back: 0,
+            pilot_until: 0,
             capture_count: 0,
             gone_said: false,
             state: None,
@@ -310,26 +313,35 @@ impl World {
     }
 
     fn faults_turn(&mut self) {
-        if self.faults.link_restarts.contains(&self.tick) && self.vehicle.landed == 0 {
+        let piloted = self.vehicle.commander == Commander::Pilot.code();
+        if self.faults.link_restarts.contains(&self.tick) && self.vehicle.landed == 0 && !piloted {
+            // It takes back only what it had.
+            let flew = self.vehicle.mode == FlightMode::Offboard.code();
             self.vehicle.mode = FlightMode::Hold.code();
             self.vehicle.streaming = 0;
             self.drop_target();
             if let Some((id, ..)) = self.command.take() {
                 self.answer(id, CommandStatus::Restarted);
             }
-            self.link_back = self.tick + 100;
+            self.link_back = if flew { self.tick + 100 } else { 0 };
         }
-        if self.link_back == self.tick && self.vehicle.mode == FlightMode::Hold.code() && self.vehicle.landed == 0 {
+        if self.link_back == self.tick
+            && !piloted
+            && self.vehicle.mode == FlightMode::Hold.code()
+            && self.vehicle.landed == 0
+        {
             self.take_control();
         }
-        if let Some(at) = self.faults.pilot {
-            if self.tick == at {
-                self.vehicle.mode = FlightMode::Pilot.code();
-                self.vehicle.commander = Commander::Pilot.code();
-                self.vehicle.streaming = 0;
-                self.drop_target();
-            } else if self.tick == at + 500 {
-                self.faults.commands.insert(self.tick, MissionCommand::GoOn);
+        if let Some(&ticks) = self.faults.pilots.get(&self.tick)
+            && self.vehicle.landed == 0
+        {
+            self.vehicle.mode = FlightMode::Pilot.code();
+            self.vehicle.commander = Commander::Pilot.code();
+            self.vehicle.streaming = 0;
+            self.pilot_until = self.tick + ticks;
+            self.drop_target();
+            if let Some((id, ..)) = self.command.take() {
+                self.answer(id, CommandStatus::Refused);
             }
         }
         if self.vehicle.landed == 0 {
@@ -499,6 +511,11 @@ impl World {
                 if command == VehicleCommand::ShiftWorld {
                     assert_eq!(request.reset_count, self.vehicle.reset_count);
                     self.shift = DVec3::from_array(request.shift_m);
+                }
+                let piloted = self.vehicle.commander == Commander::Pilot.code();
+                if piloted && (command != VehicleCommand::GoOn || self.tick < self.pilot_until) {
+                    self.answer(id, CommandStatus::Refused);
+                    return;
                 }
                 self.command = Some((id, command, request.altitude_m, self.tick));
                 if [VehicleCommand::Land, VehicleCommand::Return, VehicleCommand::Hold, VehicleCommand::ShiftWorld]

@@ -4,7 +4,7 @@
 //! killed, and it was for memory, the next one keeps three quarters of what the newest checkpoint holds at most, remembers
 //! that in `model/memory.json`, and says so.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 use serde::{Deserialize, Serialize};
@@ -47,14 +47,24 @@ impl Record {
     }
 }
 
-/// Processes that the kernel has killed for memory since it was started; 0 where it does not tell.
+/// Processes that the kernel has killed for memory: of this process's control group where it counts them, else of the whole
+/// machine; 0 where nobody tells.
 #[must_use]
 pub fn kernel_kills() -> u64 {
-    let text = std::fs::read_to_string("/proc/vmstat").unwrap_or_default();
-    text.lines()
-        .find_map(|line| line.strip_prefix("oom_kill "))
-        .and_then(|count| count.trim().parse().ok())
-        .unwrap_or(0)
+    let read = |path: &Path| std::fs::read_to_string(path).ok();
+    let group =
+        read(Path::new("/proc/self/cgroup")).and_then(|groups| events_file(&groups)).and_then(|path| read(&path));
+    group.as_deref().and_then(kills_of).or_else(|| kills_of(&read(Path::new("/proc/vmstat"))?)).unwrap_or(0)
+}
+
+/// Where the kernel counts what befell a control group, of the lines of `/proc/self/cgroup`; version 2 only.
+fn events_file(groups: &str) -> Option<PathBuf> {
+    let group = groups.lines().find_map(|line| line.strip_prefix("0::/"))?;
+    Some(Path::new("/sys/fs/cgroup").join(group).join("memory.events"))
+}
+
+fn kills_of(counts: &str) -> Option<u64> {
+    counts.lines().find_map(|line| line.strip_prefix("oom_kill ")).and_then(|count| count.trim().parse().ok())
 }
 
 /// Most Gaussians, of `most` that are configured: fewer where the last trainer died of them. `held` gives how many the newest
@@ -127,6 +137,18 @@ mod tests {
             most(Some("signal 6"), 5, None);
         }
         assert_eq!(most(None, 5, None), 500);
+    }
+
+    #[test]
+    fn kills_are_counted_by_the_control_group_or_by_the_machine() {
+        let path = events_file("1:cpu:/a\n0::/vantage.slice/vantage-trainer.service\n");
+        assert_eq!(
+            path.as_deref(),
+            Some(Path::new("/sys/fs/cgroup/vantage.slice/vantage-trainer.service/memory.events"))
+        );
+        assert_eq!(events_file("4:memory:/a\n"), None);
+        assert_eq!(kills_of("low 0\noom 3\noom_kill 2\noom_group_kill 0\n"), Some(2));
+        assert_eq!(kills_of("nr_free_pages 5\n"), None);
     }
 
     #[test]

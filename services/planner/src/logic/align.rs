@@ -88,6 +88,8 @@ pub fn align(
 struct Surfel {
     mean_m: DVec3,
     normal: DVec3,
+    /// How flat it is: 1 is a plane, 0 spreads as much along the normal as along the surface, as pure noise does.
+    flatness: f64,
 }
 
 /// Edge of cells that an image fills well: three pixels at its median depth.
@@ -120,7 +122,12 @@ fn surfels(points: &[DVec3], cell_m: f64) -> Vec<Surfel> {
         }
         let mean_m = *sum / f64::from(*count);
         let outer = DMat3::from_cols(mean_m * mean_m.x, mean_m * mean_m.y, mean_m * mean_m.z);
-        Some(Surfel { mean_m, normal: thinnest(*squares * f64::from(*count).recip() - outer) })
+        let covariance = *squares * f64::from(*count).recip() - outer;
+        let normal = thinnest(covariance);
+        let (least, all) =
+            (normal.dot(covariance * normal), covariance.x_axis.x + covariance.y_axis.y + covariance.z_axis.z);
+        let flatness = (1.0 - 2.0 * least / (all - least).max(1e-12)).clamp(0.0, 1.0);
+        Some(Surfel { mean_m, normal, flatness })
     };
     cells.values().filter_map(of_cell).collect()
 }
@@ -260,9 +267,10 @@ fn improvement(grid: &Grid, new: &[Surfel], shift_m: DVec3, anchor_m: DVec3, rea
         let at = surfel.mean_m + shift_m;
         let Some(known) = grid.nearest(at, reach_m) else { continue };
         let away = known.mean_m - at;
-        let n = known.normal;
-        normal += DMat3::from_cols(n * n.x, n * n.y, n * n.z);
-        right += n * n.dot(away);
+        // A normal made of noise says nothing of where the surface is.
+        let (n, weight) = (known.normal, known.flatness.powi(2));
+        normal += DMat3::from_cols(n * n.x, n * n.y, n * n.z) * weight;
+        right += n * n.dot(away) * weight;
         count += 1.0;
     }
     // Along surfaces that all face one way only their edges tell, as the heights did.

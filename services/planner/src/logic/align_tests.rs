@@ -57,7 +57,7 @@ proptest! {
         let rest_m = off_m - above.shift_m;
         let again = views(&rock(), rest_m, intrinsics, noise, seed ^ 7);
         let both = fit(&stored, &[&again[0], &again[1]]).expect("seen from both");
-        prop_assert!((both.shift_m - rest_m).length() < 0.025 + 1.5 * noise, "{both:?} for {rest_m}");
+        prop_assert!((both.shift_m - rest_m).length() < 0.025 + 3.0 * noise, "{both:?} for {rest_m}");
         prop_assert!(both.residual_m < 0.04, "{both:?}");
     }
 }

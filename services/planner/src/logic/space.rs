@@ -126,6 +126,14 @@ impl FreeSpace {
             && !self.occupancy.blocks(point_m)
     }
 
+    /// Whether the vehicle may sink to the ground from a point: the whole way keeps the clearance from the box.
+    #[must_use]
+    pub fn may_sink(&self, from_m: DVec3) -> bool {
+        // Of the points below, the one at the height of the box's centre is nearest to it.
+        let nearest = from_m.with_z(from_m.z.min(self.obstacle.center_m.z));
+        self.box_distance(nearest) >= self.clearance_m
+    }
+
     /// Whether a segment of a path between two ends is free. Away from the ends the margin is kept as well. An end that is
     /// itself too near (the wind pushed the vehicle, or an obstacle was seen late) may be left, but only outward.
     #[must_use]

@@ -85,8 +85,9 @@ impl Mission {
             return self.fly_next(vehicle, &[shot]);
         }
         let has_side = self.survey_view(KeyframeReason::CheckSide).is_some();
-        let Some(fit) = self.fit(views, has_side) else {
-            return self.misaligned(None, "the object is not seen where the prior has it");
+        let fit = match self.fit(views, has_side) {
+            Ok(fit) => fit,
+            Err(why) => return self.misaligned(None, &why),
         };
         let shift_m = fit.shift_m.length();
         tracing::info!(
@@ -115,9 +116,13 @@ impl Mission {
         State::Deciding
     }
 
-    fn fit(&self, views: &mut dyn Views, has_side: bool) -> Option<Fit> {
-        let (prior, _) = self.ledger.prior?;
-        let mut read = |reason: KeyframeReason| self.read_survey(reason, views);
+    /// Lays the views of now onto those of the prior, or says why not.
+    fn fit(&self, views: &mut dyn Views, has_side: bool) -> Result<Fit, String> {
+        let (prior, _) = self.ledger.prior.ok_or("the journal has no prior")?;
+        let mut read = |reason: KeyframeReason| {
+            let view = self.read_survey(reason, views);
+            view.ok_or_else(|| format!("the mission folder's view {} cannot be read; expected it whole", reason.name()))
+        };
         let stored = [read(KeyframeReason::PriorOverhead)?, read(KeyframeReason::PriorSide)?];
         let mut seen = vec![read(KeyframeReason::CheckOverhead)?];
         if has_side {
@@ -126,6 +131,7 @@ impl Mission {
         let (stored, seen): (Vec<&DepthView>, Vec<&DepthView>) = (stored.iter().collect(), seen.iter().collect());
         let around_m = DVec3::from_array(prior.center_m);
         align(&stored, &seen, &prior.ground, around_m, self.setup.planner.survey_radius_m)
+            .ok_or_else(|| "the object is not seen where the prior has it".to_owned())
     }
 
     pub(super) fn misaligned(&mut self, residual_m: Option<f64>, why: &str) -> State {

@@ -10,6 +10,8 @@ mod rounds;
 mod survey;
 mod vehicle;
 
+pub use rounds::round_request;
+
 use std::collections::BTreeSet;
 
 use glam::DVec3;
@@ -318,8 +320,15 @@ impl Mission {
             }
             MissionCommand::Land => {
                 self.recalled = false;
-                self.record(Record::Ending { reason: EndReason::Operator, land_here: true });
-                self.state = if self.on_ground() { State::Finishing } else { State::Landing };
+                let land_here = self.may_land_here();
+                self.record(Record::Ending { reason: EndReason::Operator, land_here });
+                // A pilot who flies may land it, or give it back and be followed by `go-on`.
+                self.state = match self.state {
+                    _ if self.on_ground() => State::Finishing,
+                    State::Suspended(_) if !self.commanded_by_us() => State::Suspended(false),
+                    _ if land_here => State::Landing,
+                    _ => State::Deciding,
+                };
                 Ok(())
             }
             MissionCommand::Abort => {

@@ -1,6 +1,7 @@
 //! Training rounds, scoring and selection, which go on whatever the vehicle does (Algorithm 1, lines 9 to 24).
 
 use glam::DVec3;
+use shared_types::config::PlannerConfig;
 use shared_types::config::planner::{MissionMode, Strategy};
 use shared_types::messages::{
     CandidateScore, CandidateView, EndReason, KeyframeReason, RoundReply, RoundRequest, RoundStatus, ScoreReply,
@@ -83,17 +84,7 @@ impl Mission {
         let Some((prior, _)) = self.ledger.prior else { return };
         let config = &self.setup.planner;
         let keyframes = self.ledger.taken.iter().take(round.views).map(|taken| taken.shot.keyframe_id).collect();
-        let request = RoundRequest {
-            round: round.round,
-            max_iterations: round.max_iterations,
-            stop_when_flat: u32::from(config.stop_when_flat),
-            window: if config.strategy == Strategy::Nbv { 0 } else { config.orbit_window },
-            box_center_m: prior.center_m,
-            box_size_m: prior.size_m,
-            radius_m: radius_m(prior.size_m, config),
-            ground_z_m: prior.ground_z_m(),
-            seed: split_mix(self.setup.seed ^ (u64::from(round.round) << 40)),
-        };
+        let request = round_request(config, self.setup.seed, &prior, round.round, round.max_iterations);
         self.round_sent = Some(round.request);
         self.progress_ns = self.now_ns;
         self.out.effects.push(Effect::Round(round.request, request, keyframes));
@@ -375,4 +366,26 @@ impl Mission {
 
 fn finite(value: f64) -> f64 {
     if value.is_finite() { value } else { 0.0 }
+}
+
+/// What the trainer is asked for in a round. Also for a replay of a mission folder, whose journal names the rounds.
+#[must_use]
+pub fn round_request(
+    config: &PlannerConfig,
+    seed: u64,
+    prior: &Prior,
+    round: u32,
+    max_iterations: u32,
+) -> RoundRequest {
+    RoundRequest {
+        round,
+        max_iterations,
+        stop_when_flat: u32::from(config.stop_when_flat),
+        window: if config.strategy == Strategy::Nbv { 0 } else { config.orbit_window },
+        box_center_m: prior.center_m,
+        box_size_m: prior.size_m,
+        radius_m: radius_m(prior.size_m, config),
+        ground_z_m: prior.ground_z_m(),
+        seed: split_mix(seed ^ (u64::from(round) << 40)),
+    }
 }

@@ -112,6 +112,16 @@ impl Mission {
         }
     }
 
+    /// Whether the way straight down keeps its distance from the object, or, before that is known, from where it may be.
+    pub(super) fn may_land_here(&self) -> bool {
+        let (Some(vehicle), Some(terrain)) = (&self.vehicle, &self.terrain) else { return true };
+        let free = terrain.space.may_sink(DVec3::from_array(vehicle.position_m));
+        if !free {
+            tracing::warn!("the object is below or too near to land here: returning, to land at home");
+        }
+        free
+    }
+
     pub(super) fn preparing(&mut self) -> State {
         if self.homeward() && self.on_ground() {
             return State::Finishing;
@@ -152,6 +162,9 @@ impl Mission {
         if !grounded && self.commander() == Some(Commander::Pilot) {
             return self.suspend();
         }
+        if !grounded && self.ledger.ending.is_some_and(|(_, land_here)| land_here) {
+            return State::Landing;
+        }
         let taking_off = self.pending.as_ref().is_some_and(|pending| pending.command == VehicleCommand::Takeoff);
         let command = if grounded && vehicle.armed == 0 && !taking_off {
             VehicleCommand::Arm
@@ -162,6 +175,10 @@ impl Mission {
             return State::Launching;
         } else if Self::under_control(&vehicle) {
             self.flown = true;
+            // Seen before its answer came: nobody need ask again.
+            if let Some(pending) = self.pending.take() {
+                self.out.effects.push(crate::io::Effect::CommandOver(pending.id));
+            }
             if self.ledger.airborne.is_none() {
                 self.record(Record::Airborne { home_m: vehicle.home_m });
             }
@@ -215,8 +232,11 @@ impl Mission {
         if self.on_ground() {
             return State::Finishing;
         }
+        if self.commander() == Some(Commander::Pilot) {
+            return self.suspend();
+        }
         let going = [FlightMode::Return.code(), FlightMode::Land.code()].contains(&vehicle.mode);
-        if self.commander() == Some(Commander::Pilot) || (going && self.pending.is_none()) {
+        if going && self.pending.is_none() {
             return State::Homing;
         }
         let answer = self.ensure(VehicleCommand::Return, 0.0);
@@ -235,9 +255,12 @@ impl Mission {
             }
             return State::Finishing;
         }
-        // A pilot lands it himself; a landing under way is waited for.
-        let landing = vehicle.mode == FlightMode::Land.code() && self.pending.is_none();
-        if self.commander() != Some(Commander::Pilot) && !landing {
+        // He lands it himself, or gives it back and the operator says go on.
+        if self.commander() == Some(Commander::Pilot) {
+            return self.suspend();
+        }
+        // A landing under way is waited for.
+        if vehicle.mode != FlightMode::Land.code() || self.pending.is_some() {
             self.ensure(VehicleCommand::Land, 0.0);
         }
         State::Landing
