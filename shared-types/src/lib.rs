@@ -5,6 +5,7 @@
 //! - [`bus`]: the one thin wrapper over iceoryx2 that every service uses: publishers, subscribers, requests with replies;
 //! - [`service`]: the loop every service runs in, on the mission clock (lockstep) or the machine's (wall);
 //! - [`system`]: one vehicle and its services: folders, shared-memory prefix;
+//! - [`describe`]: payloads as JSON, for people and viewers;
 //! - [`frames`]: poses and the pinhole camera;
 //! - [`config`]: the configuration file;
 //! - [`folder`]: the mission folder, and files that appear whole;
@@ -15,6 +16,7 @@
 pub mod bus;
 pub mod channel;
 pub mod config;
+pub mod describe;
 pub mod fault_point;
 pub mod folder;
 pub mod frames;
@@ -57,6 +59,8 @@ pub fn s_from_ns(ns: u64) -> f64 {
 pub mod private {
     pub use bytemuck::{Pod, Zeroable};
     pub use iceoryx2::prelude::ZeroCopySend;
+    pub use serde_json::{Map, Value};
 
+    pub use crate::describe::{object_schema, tell, tell_schema};
     pub use crate::payload::{SCHEMA_SEED, fold, fold_text};
 }

@@ -7,10 +7,12 @@
 use bytemuck::Pod;
 use iceoryx2::prelude::ZeroCopySend;
 
+use crate::describe::Describe;
+
 /// Data without pointers, padding, enums, bools or options, laid out as C does, which another process may read in place.
 ///
 /// Implemented by [`payload!`](crate::payload!) for structs, here for numbers and arrays of payloads.
-pub trait Payload: Pod + ZeroCopySend + core::fmt::Debug + Send + Sync + 'static {
+pub trait Payload: Pod + ZeroCopySend + Describe + core::fmt::Debug + Send + Sync + 'static {
     /// Hash of the declaration, so that two processes can tell whether they mean the same bytes.
     const SCHEMA: u64;
 }
@@ -77,6 +79,20 @@ macro_rules! payload {
         // SAFETY: the type is `Pod`: `repr(C)`, without pointers, references, padding or drop glue.
         unsafe impl $crate::private::ZeroCopySend for $name {
             unsafe fn type_name() -> &'static str { stringify!($name) }
+        }
+
+        impl $crate::describe::Describe for $name {
+            fn json(&self) -> $crate::private::Value {
+                let mut fields = $crate::private::Map::new();
+                $( $crate::private::tell(&mut fields, stringify!($field), &self.$field); )*
+                $crate::private::Value::Object(fields)
+            }
+
+            fn schema() -> $crate::private::Value {
+                let mut fields = $crate::private::Map::new();
+                $( $crate::private::tell_schema::<$kind>(&mut fields, stringify!($field)); )*
+                $crate::private::object_schema(stringify!($name), fields)
+            }
         }
 
         impl $crate::Payload for $name {

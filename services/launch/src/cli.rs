@@ -28,7 +28,7 @@ pub enum Command {
         vantage resume missions/20260801-120000-0 --set trainer.backend=cpu")]
     Resume(Resume),
     /// Show what runs, since when, restarts, memory and ages of the last messages.
-    #[command(after_help = "Example: vantage status --json")]
+    #[command(after_help = "Example: vantage status --watch --channels")]
     Status(Status),
     /// Tell a flying mission to return, land and save.
     #[command(after_help = "Example: vantage stop --system fly-4711")]
@@ -42,6 +42,15 @@ pub enum Command {
     /// Let a mission go on that waits: after a pilot has given the vehicle back, or after `vantage abort`.
     #[command(after_help = "Example: vantage go-on")]
     GoOn(Order),
+    /// Print the messages of one channel as they come, or write its images; nobody else notices.
+    #[command(after_help = "Example: vantage tap vehicle/state --rate 2\n         \
+        vantage tap camera/keyframe --png views\n         \
+        vantage tap scorer/score --json --count 2 (a request and its reply)\n\
+        `vantage status --channels` lists the channels.")]
+    Tap(Tap),
+    /// Change the log level of one service of a running system, or of all; nothing is started again.
+    #[command(after_help = "Example: vantage log trainer debug")]
+    Log(Log),
     /// Check this machine and say what to do about what is found.
     #[command(after_help = "Example: vantage doctor --clean")]
     Doctor(Doctor),
@@ -55,6 +64,13 @@ pub enum Command {
     #[command(after_help = "Example: vantage reconstruct missions/20260801-120000-0 --iterations 30000\n\
         A run that was cut off goes on when its command is given again.")]
     Reconstruct(Reconstruct),
+    /// Run one or more services alone on a recording, as fast as they can: what the others sent is sent again.
+    #[command(
+        after_help = "Example: vantage replay missions/20260801-120000-0/recording.mcap --services trainer,scorer\n         \
+        vantage replay missions/20260801-120000-0 --services trainer --from 60 --set trainer.backend=gpu\n\
+        A mission folder without a recording gives its keyframes and training rounds."
+    )]
+    Replay(Replay),
     /// Print a configuration file with every key, its default and what it means.
     #[command(after_help = "Example: vantage config --preset quick > mission.toml")]
     Config(Configure),
@@ -81,6 +97,9 @@ pub enum Process {
     /// The mission.
     #[command(after_help = "Example: vantage planner --system lab")]
     Planner(Service),
+    /// Every channel to a recording.
+    #[command(after_help = "Example: vantage recorder --system lab")]
+    Recorder(Service),
     /// Holds the channels open and cleans up after the dead.
     #[command(after_help = "Example: vantage keeper --system lab")]
     Keeper(Service),
@@ -102,6 +121,7 @@ impl Process {
             Self::Trainer(service) => (ServiceName::Trainer, service),
             Self::Scorer(service) => (ServiceName::Scorer, service),
             Self::Planner(service) => (ServiceName::Planner, service),
+            Self::Recorder(service) => (ServiceName::Recorder, service),
             Self::Keeper(service) => (ServiceName::Keeper, service),
             Self::Simulator(service) => (ServiceName::Simulator, service),
             Self::World(service) => (ServiceName::World, service),
@@ -172,6 +192,12 @@ pub struct Status {
     /// Name or folder of the system; default: the only one there is.
     #[arg(long, value_name = "NAME")]
     pub system: Option<String>,
+    /// Show the channels too: who is on them, their memory, rates and ages. JSON has them always.
+    #[arg(long)]
+    pub channels: bool,
+    /// Again and again, until Ctrl-C; as JSON, a line each time.
+    #[arg(long)]
+    pub watch: bool,
     /// As JSON.
     #[arg(long)]
     pub json: bool,
@@ -180,6 +206,51 @@ pub struct Status {
 /// Arguments of the operator's orders.
 #[derive(Debug, Clone, Args)]
 pub struct Order {
+    /// Name or folder of the system; default: the only one there is.
+    #[arg(long, value_name = "NAME")]
+    pub system: Option<String>,
+}
+
+/// Arguments of `tap`.
+#[derive(Debug, Clone, Args)]
+pub struct Tap {
+    /// The channel, such as vehicle/state; of a pair of channels, such as scorer/score, request and reply.
+    pub channel: String,
+    /// As JSON, a line for each message, with its items.
+    #[arg(long)]
+    pub json: bool,
+    /// Write the images of messages into this folder.
+    #[arg(long, value_name = "DIR")]
+    pub png: Option<PathBuf>,
+    /// Messages a second at most; those between are passed over.
+    #[arg(long, value_name = "HZ", value_parser = positive)]
+    pub rate: Option<f64>,
+    /// End after so many messages; default: with the system, or Ctrl-C.
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
+    pub count: Option<u64>,
+    /// Name or folder of the system; default: the only one there is.
+    #[arg(long, value_name = "NAME")]
+    pub system: Option<String>,
+}
+
+fn not_negative(text: &str) -> Result<f64, String> {
+    let value: f64 = text.parse().map_err(|_| "expected a number".to_owned())?;
+    if value.is_finite() && value >= 0.0 { Ok(value) } else { Err("expected a number of 0 or more".to_owned()) }
+}
+
+fn positive(text: &str) -> Result<f64, String> {
+    let value: f64 = text.parse().map_err(|_| "expected a number".to_owned())?;
+    if value.is_finite() && value > 0.0 { Ok(value) } else { Err("expected a number above 0".to_owned()) }
+}
+
+/// Arguments of `log`.
+#[derive(Debug, Clone, Args)]
+pub struct Log {
+    /// The service, or `all`.
+    pub service: String,
+    /// What it logs from now on.
+    #[arg(value_parser = clap::builder::PossibleValuesParser::new(shared_types::logging::LEVELS))]
+    pub level: String,
     /// Name or folder of the system; default: the only one there is.
     #[arg(long, value_name = "NAME")]
     pub system: Option<String>,
@@ -367,6 +438,38 @@ pub enum Mask {
     Off,
 }
 
+/// Arguments of `replay`.
+#[derive(Debug, Clone, Args)]
+pub struct Replay {
+    /// A recording (recording.mcap), or a mission folder.
+    #[arg(value_name = "FILE|DIR")]
+    pub input: PathBuf,
+    /// Services that run: camera, trainer, scorer, planner, world. What they sent then is left out.
+    #[arg(long, value_name = "NAMES", value_delimiter = ',', required = true)]
+    pub services: Vec<String>,
+    /// Simulated seconds per wall second at most; 0: as fast as the services are.
+    #[arg(long, default_value_t = 0.0, value_name = "X", value_parser = not_negative)]
+    pub speed: f64,
+    /// Seconds of the recording to pass over; keyframes of them are there all the same.
+    #[arg(long, default_value_t = 0.0, value_name = "S", value_parser = not_negative)]
+    pub from: f64,
+    /// Folder for what the services write; default: replay-1 and so on, beside the recording.
+    #[arg(long, value_name = "DIR")]
+    pub output: Option<PathBuf>,
+    /// Record the replay too.
+    #[arg(long)]
+    pub record: bool,
+    /// One key of the services' configuration, laid over the recording's; may be given many times.
+    #[arg(long = "set", value_name = "SECTION.KEY=VALUE")]
+    pub sets: Vec<String>,
+    /// Name of the system; default: a fresh one.
+    #[arg(long, value_name = "NAME")]
+    pub system: Option<String>,
+    /// The services are started by somebody else.
+    #[arg(long, hide = true)]
+    pub joined: bool,
+}
+
 /// Arguments of `config`.
 #[derive(Debug, Clone, Args)]
 pub struct Configure {
@@ -384,6 +487,12 @@ pub struct Service {
     /// Name or folder of the system to join; made if there is none of that name. Default: the only one there is.
     #[arg(long, value_name = "NAME")]
     pub system: Option<String>,
+    /// Alone, on a recording or a mission folder, in the foreground: for a debugger or a profiler.
+    #[arg(long, requires = "input")]
+    pub standalone: bool,
+    /// The recording or mission folder of --standalone.
+    #[arg(long, value_name = "FILE|DIR", requires = "standalone")]
+    pub input: Option<PathBuf>,
     /// Started by a supervisor: stop when it is gone.
     #[arg(long, hide = true)]
     pub supervised: bool,

@@ -4,13 +4,16 @@
 //! - [`service`]: one process of a mission in the foreground;
 //! - [`fly`], [`supervise`], [`progress`], [`summary`]: a whole mission;
 //! - [`evaluate`], [`export`]: what a mission folder is worth, and how it leaves Vantage;
+//! - [`replay`]: services alone on what was recorded;
 //! - [`reconstruct`]: offline training on a mission folder or another dataset;
-//! - [`status`], [`order`], [`doctor`]: what runs, the operator's word to it, and whether this machine is fit for it.
+//! - [`status`], [`tap`]: what runs, and what it says;
+//! - [`order`], [`control`], [`doctor`]: the operator's word to it, its logs, and whether this machine is fit for it.
 
 #![forbid(unsafe_code)]
 
 pub mod cli;
 pub mod clock;
+pub mod control;
 pub mod doctor;
 pub mod evaluate;
 pub mod exit;
@@ -21,12 +24,15 @@ pub mod machine_check;
 pub mod order;
 pub mod proc;
 pub mod progress;
+pub mod reach;
 pub mod reconstruct;
+pub mod replay;
 pub mod service;
 pub mod settings;
 pub mod status;
 pub mod summary;
 pub mod supervise;
+pub mod tap;
 
 use std::process::ExitCode;
 
@@ -88,10 +94,13 @@ fn run(command: &Command) -> anyhow::Result<Exit> {
         Command::Land(arguments) => order::run(MissionCommand::Land, arguments),
         Command::Abort(arguments) => order::run(MissionCommand::Abort, arguments),
         Command::GoOn(arguments) => order::run(MissionCommand::GoOn, arguments),
+        Command::Tap(arguments) => tap::run(arguments),
+        Command::Log(arguments) => control::log(arguments),
         Command::Doctor(arguments) => doctor::run(arguments),
         Command::Evaluate(arguments) => evaluate::run(arguments),
         Command::Export(arguments) => export_any(arguments),
         Command::Reconstruct(arguments) => reconstruct::run(arguments),
+        Command::Replay(arguments) => replay::run(arguments),
         Command::Config(arguments) => {
             print(&shared_types::config::commented(&settings::resolve(&arguments.settings)?)?)
         }
@@ -154,10 +163,17 @@ pub(crate) fn say(text: &str) {
 
 /// Writes to standard output; a reader that has seen enough (`| head`) is no error.
 pub(crate) fn print(text: &str) -> anyhow::Result<Exit> {
+    print_on(text).map(|_| Exit::Ok)
+}
+
+/// As [`print`]; false where the reader has seen enough, so that whoever has more to say may stop.
+pub(crate) fn print_on(text: &str) -> anyhow::Result<bool> {
     use std::io::Write as _;
-    match std::io::stdout().write_all(text.as_bytes()) {
-        Err(error) if error.kind() != std::io::ErrorKind::BrokenPipe => Err(error.into()),
-        _ => Ok(Exit::Ok),
+    let mut output = std::io::stdout();
+    match output.write_all(text.as_bytes()).and_then(|()| output.flush()) {
+        Err(error) if error.kind() == std::io::ErrorKind::BrokenPipe => Ok(false),
+        Err(error) => Err(error.into()),
+        Ok(()) => Ok(true),
     }
 }
 

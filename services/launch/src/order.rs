@@ -1,6 +1,5 @@
 //! `vantage stop`, `land`, `abort`, `go-on`: the operator's word to a mission that flies.
 
-use std::sync::mpsc::sync_channel;
 use std::time::{Duration, Instant};
 
 use shared_types::ServiceName;
@@ -15,6 +14,7 @@ use crate::cli::Order;
 use crate::clock::monotonic_ns;
 use crate::exit::{Exit, Refusal};
 use crate::print;
+use crate::reach::in_time;
 
 /// A planner answers within a tick; one that was just killed is back before this.
 const PATIENCE: Duration = Duration::from_secs(10);
@@ -30,13 +30,8 @@ pub fn run(command: MissionCommand, arguments: &Order) -> anyhow::Result<Exit> {
         return Err(Refusal::missing(format!("system {name} is dead: nobody there takes an order")));
     }
     let config = load(&[Layer::of_file(&system.config_path())?])?;
-    let (sender, receiver) = sync_channel(1);
-    // As for `status`: joining a bus may wait for ever for what a killed process left half-made.
-    std::thread::Builder::new().name("order".to_owned()).spawn(move || {
-        // Nobody listens any more when it took too long.
-        sender.send(give(command, &system, &config)).ok();
-    })?;
-    let answer = receiver.recv_timeout(PATIENCE + Duration::from_secs(2)).unwrap_or(Ok(None))?;
+    let answer =
+        in_time("order", PATIENCE + Duration::from_secs(2), move || give(command, &system, &config))?.flatten();
     match answer {
         None => Err(Refusal::missing(format!(
             "no answer to {command} from the planner of system {name} within {} s; `vantage status` shows what runs",

@@ -10,8 +10,37 @@ pub fn pss_bytes(pid: u32) -> Option<u64> {
 }
 
 fn pss_of(rollup: &str) -> Option<u64> {
-    let line = rollup.lines().find_map(|line| line.strip_prefix("Pss:"))?;
+    bytes_of(rollup, "Pss:")
+}
+
+fn bytes_of(rollup: &str, key: &str) -> Option<u64> {
+    let line = rollup.lines().find_map(|line| line.strip_prefix(key))?;
     Some(line.split_whitespace().next()?.parse::<u64>().ok()? * 1024)
+}
+
+/// Proportional memory of a process by kind, bytes.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Memory {
+    /// Its own: heap and stacks.
+    pub anonymous: u64,
+    /// Its program and mapped files.
+    pub file: u64,
+    /// Its share of shared memory: the channels.
+    pub shared: u64,
+}
+
+/// The memory of a process by kind; `None` when it is gone or may not be looked at.
+#[must_use]
+pub fn memory(pid: u32) -> Option<Memory> {
+    memory_of(&fs::read_to_string(format!("/proc/{pid}/smaps_rollup")).ok()?)
+}
+
+fn memory_of(rollup: &str) -> Option<Memory> {
+    Some(Memory {
+        anonymous: bytes_of(rollup, "Pss_Anon:")?,
+        file: bytes_of(rollup, "Pss_File:")?,
+        shared: bytes_of(rollup, "Pss_Shmem:")?,
+    })
 }
 
 /// Whether a process runs (a zombie does not).
@@ -79,6 +108,9 @@ mod tests {
         assert!(age_s(pid).is_some_and(|age| age < 3600.0));
         assert!(nice(pid).is_some());
         assert_eq!(tracer(pid), None);
+        let rollup = "Pss: 9 kB\nPss_Dirty: 1 kB\nPss_Anon: 2 kB\nPss_File: 3 kB\nPss_Shmem: 4 kB\n";
+        assert_eq!(memory_of(rollup), Some(Memory { anonymous: 2048, file: 3072, shared: 4096 }));
+        assert!(memory(pid).is_some_and(|memory| memory.anonymous > 10_000));
         assert_eq!(pss_of("00400000-7ffd rollup\nRss:  900 kB\nPss:  123 kB\n"), Some(123 * 1024));
     }
 

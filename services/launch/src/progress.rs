@@ -115,6 +115,13 @@ impl Progress {
         }
     }
 
+    /// Says how something goes that takes a while; nothing without a terminal.
+    pub fn doing_quietly(&self, text: &str) {
+        if let Some(bar) = &self.bar {
+            bar.set_message(text.to_owned());
+        }
+    }
+
     /// Takes the changing line away.
     pub fn clear(&self) {
         if let Some(bar) = &self.bar {

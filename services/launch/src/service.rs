@@ -15,6 +15,7 @@ use shared_types::system::{Hold, System, SystemError};
 
 use crate::cli::Service;
 use crate::exit::Refusal;
+use crate::replay::alone::Played;
 use crate::settings;
 use crate::supervise::plan::apply_scheduling;
 
@@ -31,8 +32,12 @@ pub fn run(name: ServiceName, arguments: &Service) -> anyhow::Result<()> {
         tracing::debug!(%error, "the process keeps its name");
     }
     shared_types::memory::give_back_freed_memory();
+    let played = arguments.input.as_deref().map(|input| Played::begin(name, input)).transpose()?;
     apply_scheduling(name);
-    let (system, config, made) = join(arguments)?;
+    let (system, config, made) = match &played {
+        Some(played) => played.join()?,
+        None => join(arguments)?,
+    };
     let left_behind = arguments.supervised.then(|| system.clone());
     if system.version != env!("CARGO_PKG_VERSION") {
         return Err(Refusal::missing(format!(
@@ -137,8 +142,8 @@ fn dispatch(name: ServiceName, mut context: Context, sweeping: Option<keeper::Sw
         },
         ServiceName::Simulator => {
             // Alone (for other ground stations, or to try something), it runs free; in a mission it waits for its members.
-            let members: &[ServiceName] = if context.supervised { &ServiceName::MEMBERS } else { &[] };
-            simulator::run(&mut context, members).map_err(|error| match error.exit_code() {
+            let members = if context.supervised { ServiceName::members(&context.config) } else { Vec::new() };
+            simulator::run(&mut context, &members).map_err(|error| match error.exit_code() {
                 64 => Refusal::usage(error.to_string()),
                 69 => Refusal::missing(error.to_string()),
                 _ => error.into(),
@@ -155,6 +160,7 @@ fn dispatch(name: ServiceName, mut context: Context, sweeping: Option<keeper::Sw
         ServiceName::Trainer => trainer::run(context),
         ServiceName::Scorer => scorer::run(context),
         ServiceName::Planner => planner::run(context),
+        ServiceName::Recorder => recorder::run(context),
         ServiceName::Command | ServiceName::Launch => Err(Refusal::usage(format!("{name} is no service"))),
     }
 }
@@ -187,7 +193,7 @@ mod tests {
 
     fn arguments(system: &str) -> Service {
         let settings = crate::cli::Settings { preset: "tiny".to_owned(), ..crate::cli::Settings::default() };
-        Service { settings, system: Some(system.to_owned()), supervised: false }
+        Service { settings, system: Some(system.to_owned()), supervised: false, standalone: false, input: None }
     }
 
     #[test]

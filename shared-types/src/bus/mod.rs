@@ -4,9 +4,11 @@
 //! segments reserved at start (a full `/dev/shm` is an error here and not a SIGBUS later), late joiners served by a tick,
 //! own signal handling, requests and replies with ids. Nothing else in Vantage names iceoryx2.
 
+mod census;
 mod error;
 mod message;
 mod publisher;
+mod raw;
 mod request;
 mod subscriber;
 mod wait;
@@ -18,9 +20,11 @@ use iceoryx2::port::update_connections::UpdateConnections as _;
 use iceoryx2::prelude::*;
 use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
 
+pub use census::Census;
 pub use error::BusError;
 pub use message::{Envelope, Message};
 pub use publisher::Publisher;
+pub use raw::RawMessage;
 pub use request::{Client, ReplyAddress, Server};
 pub use subscriber::Subscriber;
 pub use wait::{Listener, wait};

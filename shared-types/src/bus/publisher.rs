@@ -138,6 +138,16 @@ impl<C: Channel> Publisher<C> {
     /// As [`Self::send_with`].
     #[doc(hidden)]
     pub fn send_wild(&mut self, envelope: Envelope, header: &C::Header, items: &[C::Item]) -> Result<(), BusError> {
+        self.send_framed(envelope, header, items)
+    }
+
+    /// Sends a copy of the items with an envelope as it is given.
+    pub(super) fn send_framed(
+        &mut self,
+        envelope: Envelope,
+        header: &C::Header,
+        items: &[C::Item],
+    ) -> Result<(), BusError> {
         self.write(items.len(), |to| to.copy_from_slice(items), |_| Framed { envelope, header: *header })
     }
 

@@ -19,6 +19,7 @@ const SOURCES: &[&str] = &[
     include_str!("planner.rs"),
     include_str!("link.rs"),
     include_str!("simulator.rs"),
+    include_str!("recorder.rs"),
     include_str!("launch.rs"),
 ];
 

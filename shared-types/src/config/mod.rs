@@ -15,6 +15,7 @@ pub mod load;
 pub mod mission;
 pub mod model;
 pub mod planner;
+pub mod recorder;
 pub mod scorer;
 pub mod simulator;
 pub mod trainer;
@@ -30,6 +31,7 @@ pub use load::{ConfigError, Layer, PRESETS, load, load_mission, preset};
 pub use mission::MissionConfig;
 pub use model::ModelConfig;
 pub use planner::PlannerConfig;
+pub use recorder::RecorderConfig;
 pub use scorer::ScorerConfig;
 pub use simulator::SimulatorConfig;
 pub use trainer::TrainerConfig;
@@ -59,6 +61,8 @@ pub struct Config {
     pub link: LinkConfig,
     /// Section `[simulator]`.
     pub simulator: SimulatorConfig,
+    /// Section `[recorder]`.
+    pub recorder: RecorderConfig,
     /// Section `[launch]`.
     pub launch: LaunchConfig,
 }
@@ -107,8 +111,13 @@ impl Config {
     #[must_use]
     pub fn problems(&self) -> Vec<Problem> {
         let mut all = Vec::new();
-        let sections: [(&str, &dyn Section); 4] =
-            [("mission", &self.mission), ("clock", &self.clock), ("planner", &self.planner), ("launch", &self.launch)];
+        let sections: [(&str, &dyn Section); 5] = [
+            ("mission", &self.mission),
+            ("clock", &self.clock),
+            ("planner", &self.planner),
+            ("recorder", &self.recorder),
+            ("launch", &self.launch),
+        ];
         for (section, values) in sections {
             let full = |problem: Problem| Problem { key: format!("{section}.{}", problem.key), ..problem };
             all.extend(values.problems().into_iter().map(full));

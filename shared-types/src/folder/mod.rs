@@ -18,6 +18,7 @@ mod png_file;
 
 pub use files::{clean_leftovers, create_dir_durable, write_atomic, write_dir_atomic};
 pub use keyframe::{Exposure, Frame, Gate, Keyframe};
+pub use png_file::write_frame;
 
 use crate::messages::KeyframeReason;
 use crate::storage;

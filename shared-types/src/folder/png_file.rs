@@ -1,11 +1,12 @@
 //! Images in PNG: 8-bit RGB and 16-bit grey, strict about files that are cut or of another kind.
 
 use std::io::Cursor;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use png::{BitDepth, ColorType};
 
-use super::FolderError;
+use super::{FolderError, write_atomic};
+use crate::messages::FrameView;
 
 /// The last chunk of every PNG. Decoders give the pixels without it; a cut file must not pass for a whole one.
 const END: [u8; 12] = [0, 0, 0, 0, b'I', b'E', b'N', b'D', 0xAE, 0x42, 0x60, 0x82];
@@ -84,6 +85,23 @@ pub(super) fn decode(path: &Path, kind: Kind, width: u32, height: u32, bytes: &[
     reader.next_frame(&mut pixels).map_err(broken)?;
     reader.finish().map_err(broken)?;
     Ok(pixels)
+}
+
+/// Writes the images of a frame, for people: `<stem>-rgb.png` where it has colour, and `<stem>-depth.png`, 16 bits in units of
+/// the header's `depth_unit_m`.
+///
+/// # Errors
+/// When a file cannot be written.
+pub fn write_frame(stem: &Path, view: &FrameView<'_>) -> Result<(), FolderError> {
+    let (width, height) = (view.header.width, view.header.height);
+    let file = |kind: &str| PathBuf::from(format!("{}-{kind}.png", stem.display()));
+    if !view.rgb.is_empty() {
+        let path = file("rgb");
+        write_atomic(&path, &encode(&path, Kind::Rgb8, width, height, view.rgb)?)?;
+    }
+    let path = file("depth");
+    let depth: Vec<u8> = view.depth_units_vec().into_iter().flat_map(u16::to_be_bytes).collect();
+    write_atomic(&path, &encode(&path, Kind::Grey16, width, height, &depth)?)
 }
 
 pub(super) fn damaged(path: &Path, field: &str, found: &str, expected: &str) -> FolderError {

@@ -1,5 +1,8 @@
-//! `health`: once a second from every service.
+//! `health`: once a second from every service; and what its supervisor is told.
 
+use std::time::Duration;
+
+use super::notify::Notifier;
 use super::{Context, Service, ServiceError};
 use crate::bus::{BusError, Publisher};
 use crate::channel::HealthChannel;
@@ -39,6 +42,7 @@ pub(super) struct HealthSender {
     turns: u64,
     turn_ns: Vec<u64>,
     worked: Worked,
+    notifier: Notifier,
 }
 
 /// When a worker was last seen to get on.
@@ -66,7 +70,13 @@ impl HealthSender {
             turns: 0,
             turn_ns: Vec::with_capacity(LONGEST_SAMPLE),
             worked: Worked::default(),
+            notifier: Notifier::new(Duration::from_secs_f64(context.config.launch.watchdog_work_s)),
         })
+    }
+
+    /// The service has begun to leave.
+    pub(super) fn leaving(&self) {
+        self.notifier.stopping();
     }
 
     pub(super) fn count_turn(&mut self, took_ns: u64) {
@@ -93,12 +103,14 @@ impl HealthSender {
             |share: usize| self.turn_ns.get(self.turn_ns.len().saturating_sub(1) * share / 100).copied().unwrap_or(0);
         let report = service.health();
         let state = if stopping { ServiceState::Stopping } else { report.state };
+        let stalled_ns = self.worked.stalled_ns(service.busy(), service.work(), wall_ns);
+        self.notifier.turn(state, &report.last_error, Duration::from_nanos(stalled_ns));
         let health = Health {
             incarnation: context.incarnation,
             turns: self.turns,
             turn_p50_ns: quantile(50),
             turn_p99_ns: quantile(99),
-            stalled_ns: self.worked.stalled_ns(service.busy(), service.work(), wall_ns),
+            stalled_ns,
             rss_bytes: resident_bytes(),
             received: report.received,
             sent: report.sent,

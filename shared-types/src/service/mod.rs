@@ -8,6 +8,7 @@
 mod control;
 mod health;
 mod lockstep;
+mod notify;
 mod signals;
 mod wall;
 
@@ -48,17 +49,26 @@ codes! {
         Planner = 8, "planner",
         /// The supervisor.
         Launch = 9, "launch",
+        /// Recordings.
+        Recorder = 10, "recorder",
     }
 }
 
 impl ServiceName {
-    /// The services that grant ticks of the mission clock.
+    /// The services that always grant ticks of the mission clock.
     pub const MEMBERS: [Self; 5] = [Self::Px4Link, Self::Camera, Self::Trainer, Self::Scorer, Self::Planner];
 
-    /// Whether this service grants ticks.
+    /// Those that grant ticks in a mission: with a recorder that is to lose nothing, it too.
     #[must_use]
-    pub fn is_member(self) -> bool {
-        Self::MEMBERS.contains(&self)
+    pub fn members(config: &Config) -> Vec<Self> {
+        let recorder = (config.recorder.enabled && config.recorder.complete).then_some(Self::Recorder);
+        Self::MEMBERS.into_iter().chain(recorder).collect()
+    }
+
+    /// Whether this service grants ticks in a mission.
+    #[must_use]
+    pub fn is_member(self, config: &Config) -> bool {
+        Self::members(config).contains(&self)
     }
 }
 
@@ -187,7 +197,7 @@ impl Context {
             .hold()
             .map_err(|error| BusError::Domain { path: system.runtime_dir.clone(), cause: error.to_string() })?;
         let incarnation = wall::monotonic_ns();
-        let by_tick = name.is_member() && config.clock.mode == ClockMode::Lockstep;
+        let by_tick = name.is_member(&config) && config.clock.mode == ClockMode::Lockstep;
         let bus = Bus::open(&system, Limits::of(&config), name, incarnation, by_tick)?;
         Ok(Self { name, bus, config, system, incarnation, supervised, _hold: hold })
     }
@@ -195,7 +205,7 @@ impl Context {
     /// Whether this service grants the ticks of a simulated clock.
     #[must_use]
     pub fn lockstep(&self) -> bool {
-        self.name.is_member() && self.config.clock.mode == ClockMode::Lockstep
+        self.name.is_member(&self.config) && self.config.clock.mode == ClockMode::Lockstep
     }
 
     /// The supervisor to be watched; `None` without one.
@@ -282,6 +292,7 @@ impl Housekeeping {
             return Ok(false);
         }
         self.stopping = wanted;
+        self.health.leaving();
         Ok(if wanted == Stopping::Asked {
             tracing::info!(service = %context.name, "asked to stop");
             service.stop(now_ns) == StopAnswer::Now

@@ -27,7 +27,7 @@ impl Domain {
     }
 
     pub fn join(&self, name: ServiceName) -> Bus {
-        Bus::open(&self.system, Limits::of(&self.config), name, 7, name.is_member()).expect("joined")
+        Bus::open(&self.system, Limits::of(&self.config), name, 7, name.is_member(&self.config)).expect("joined")
     }
 
     pub fn camera(&self) -> Context {

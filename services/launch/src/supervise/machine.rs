@@ -16,7 +16,7 @@ use shared_types::ServiceName;
 use watch::Life;
 pub use words::{Action, Event, Outcome, Policy};
 
-use super::plan::{START_ORDER, STOP_GROUPS};
+use super::plan::{DISPENSABLE, START_ORDER, STOP_GROUPS};
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Member {
@@ -211,6 +211,10 @@ impl Supervisor {
                 "{service} died and is left as it is (launch.hold_on_fault); start it again by hand with \
                  `vantage {service} --system NAME`, or end with Ctrl-C"
             )));
+        } else if deaths > limit && DISPENSABLE.contains(&service) {
+            record.member = Member::Gone;
+            actions
+                .push(Action::Say(format!("{service} died {deaths} times in a row: the mission goes on without it")));
         } else if deaths > limit {
             record.member = Member::Gone;
             self.outcome.get_or_insert(Outcome::Broken { service, code, worked: heard });

@@ -4,8 +4,9 @@ use shared_types::ServiceName;
 
 /// The services of a mission on the embedded simulator, in the order of their start. The keeper comes first, since it holds
 /// every channel open; who makes the clock and the vehicle comes before who needs them.
-pub const START_ORDER: [ServiceName; 8] = [
+pub const START_ORDER: [ServiceName; 9] = [
     ServiceName::Keeper,
+    ServiceName::Recorder,
     ServiceName::Simulator,
     ServiceName::World,
     ServiceName::Px4Link,
@@ -15,14 +16,18 @@ pub const START_ORDER: [ServiceName; 8] = [
     ServiceName::Planner,
 ];
 
-/// Groups that stop one after the other. px4-link is the last but the simulator and the keeper: while it runs, a vehicle in
-/// the air is brought home.
-pub const STOP_GROUPS: [&[ServiceName]; 4] = [
+/// Groups that stop one after the other. px4-link is the last but the recorder, the simulator and the keeper: while it runs,
+/// a vehicle in the air is brought home, and that is recorded.
+pub const STOP_GROUPS: [&[ServiceName]; 5] = [
     &[ServiceName::Planner, ServiceName::Scorer, ServiceName::Trainer, ServiceName::Camera, ServiceName::World],
     &[ServiceName::Px4Link],
+    &[ServiceName::Recorder],
     &[ServiceName::Simulator],
     &[ServiceName::Keeper],
 ];
+
+/// What a mission can do without, once it flies.
+pub const DISPENSABLE: [ServiceName; 1] = [ServiceName::Recorder];
 
 /// How the kernel's scheduler treats a process.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -41,6 +46,7 @@ pub fn scheduling(service: ServiceName) -> (i32, Policy) {
     match service {
         ServiceName::Px4Link | ServiceName::Simulator => (0, Policy::Fifo(20)),
         ServiceName::Scorer | ServiceName::World => (5, Policy::Normal),
+        ServiceName::Recorder => (10, Policy::Normal),
         ServiceName::Trainer => (15, Policy::Batch),
         _ => (0, Policy::Normal),
     }
@@ -81,11 +87,11 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_started_service_stops_once_and_px4_link_after_all_but_simulator_and_keeper() {
+    fn every_started_service_stops_once_and_px4_link_after_all_but_recorder_simulator_and_keeper() {
         let mut started: Vec<ServiceName> = START_ORDER.to_vec();
         let mut stopped: Vec<ServiceName> = STOP_GROUPS.concat();
-        let tail = &stopped[stopped.len() - 3..];
-        assert_eq!(tail, [ServiceName::Px4Link, ServiceName::Simulator, ServiceName::Keeper]);
+        let tail = &stopped[stopped.len() - 4..];
+        assert_eq!(tail, [ServiceName::Px4Link, ServiceName::Recorder, ServiceName::Simulator, ServiceName::Keeper]);
         started.sort_by_key(|service| service.code());
         stopped.sort_by_key(|service| service.code());
         assert_eq!(started, stopped);

@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 use anyhow::Context as _;
 use shared_types::ServiceName;
 use shared_types::config::{ClockMode, Config};
-use shared_types::messages::{EndReason, MissionCommand, MissionPhase, MissionState, VehicleCommand};
+use shared_types::messages::{Commander, EndReason, MissionCommand, MissionPhase, MissionState, VehicleCommand};
 use shared_types::system::System;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 use signal_hook::iterator::Signals;
@@ -67,13 +67,18 @@ fn policy(config: &Config) -> Policy {
     }
 }
 
-/// The services of a mission: without a simulated vehicle, neither simulator nor world are started.
+/// The services of a mission: without a simulated vehicle, neither simulator nor world are started; the recorder where it is
+/// asked for.
 #[must_use]
 pub fn services_of(config: &Config) -> Vec<ServiceName> {
     let simulated = config.link.is_local();
     START_ORDER
         .into_iter()
-        .filter(|service| simulated || !matches!(service, ServiceName::Simulator | ServiceName::World))
+        .filter(|service| match service {
+            ServiceName::Simulator | ServiceName::World => simulated,
+            ServiceName::Recorder => config.recorder.enabled,
+            _ => true,
+        })
         .collect()
 }
 
@@ -96,6 +101,8 @@ pub fn run(system: &System, config: &Config, starter: Starter, progress: &mut Pr
         outcome: None,
         last_words: None,
         armed: false,
+        commander: 0,
+        suspended: false,
         lacking: BTreeMap::new(),
         track: Track::default(),
         score_ms: Vec::new(),
@@ -141,6 +148,10 @@ struct Run<'a> {
     outcome: Option<Outcome>,
     last_words: Option<String>,
     armed: bool,
+    /// [`Commander`] code of the vehicle's last state.
+    commander: u32,
+    /// The mission waits for the operator, and the user was told.
+    suspended: bool,
     /// What each service said that it lacks; empty where nothing.
     lacking: BTreeMap<ServiceName, String>,
     track: Track,
@@ -167,6 +178,7 @@ impl Run<'_> {
             self.track.note(truth);
         }
         if let Some(vehicle) = heard.vehicle {
+            self.commander = vehicle.commander;
             let armed = vehicle.armed == 1;
             if armed != self.armed {
                 self.armed = armed;
@@ -215,6 +227,20 @@ impl Run<'_> {
         }
     }
 
+    /// A mission that waits for the operator would wait for ever if he did not know.
+    fn tell_who_is_waited_for(&mut self, suspended: bool) {
+        if core::mem::replace(&mut self.suspended, suspended) == suspended || !suspended {
+            return;
+        }
+        let who = match Commander::from_code(self.commander) {
+            Some(Commander::Pilot) => "a pilot flies",
+            Some(Commander::Failsafe) => "a failsafe of the autopilot flies",
+            _ => "the vehicle holds",
+        };
+        self.progress
+            .say(&format!("{who} and the mission waits; `vantage go-on` when it may fly on, `vantage stop` to end"));
+    }
+
     fn mission(&mut self, stamp_ns: u64, state: &MissionState) {
         self.last = Some(*state);
         self.ended_ns = stamp_ns.max(self.ended_ns);
@@ -223,6 +249,7 @@ impl Run<'_> {
         if matches!(report.phase, MissionPhase::Done | MissionPhase::Failed) && self.at_the_end.is_none() {
             self.at_the_end = Some((self.ports.outs(), self.supervisor.restarts()));
         }
+        self.tell_who_is_waited_for(report.phase == MissionPhase::Suspended);
         match report.phase {
             MissionPhase::Done => self.event(&Event::MissionOver { usable: true }),
             MissionPhase::Failed => self.event(&Event::MissionOver { usable: false }),

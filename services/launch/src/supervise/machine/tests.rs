@@ -1,5 +1,5 @@
 use super::*;
-use ServiceName::{Camera, Keeper, Planner, Px4Link, Scorer, Simulator, Trainer, World};
+use ServiceName::{Camera, Keeper, Planner, Px4Link, Recorder, Scorer, Simulator, Trainer, World};
 
 const POLICY: Policy = Policy {
     restart_delay_ms: 100,
@@ -412,4 +412,22 @@ proptest::proptest! {
         }
         proptest::prop_assert!(over && alive.is_empty(), "alive: {alive:?}");
     }
+}
+
+#[test]
+fn a_mission_goes_on_without_a_recorder_that_keeps_dying() {
+    let mut supervisor = flying();
+    let mut now_ms = 100;
+    let mut said = Vec::new();
+    for _ in 0..=POLICY.crash_limit {
+        let exited = Event::Exited { service: Recorder, code: Some(70) };
+        said.extend(supervisor.step(now_ms, &exited));
+        now_ms += POLICY.restart_delay_max_ms;
+        said.extend(supervisor.step(now_ms, &Event::Tick));
+    }
+    let words: Vec<_> = said.iter().filter(|action| matches!(action, Action::Say(_))).collect();
+    let [Action::Say(text)] = words[..] else { panic!("{words:?}") };
+    assert!(text.contains("the mission goes on without it"), "{text}");
+    assert!(!supervisor.is_ending());
+    assert!(!said.contains(&Action::CommandRecall));
 }

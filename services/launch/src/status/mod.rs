@@ -1,7 +1,9 @@
-//! `vantage status`: what runs, since when, memory, and how old the last messages are.
+//! `vantage status`: what runs, since when, memory, and what goes on on the channels. It looks at shared memory and `/proc`
+//! only, and asks nobody.
 
-use std::fmt::Write as _;
-use std::sync::mpsc::sync_channel;
+mod channels;
+mod words;
+
 use std::time::{Duration, Instant};
 
 use serde::Serialize;
@@ -17,7 +19,9 @@ use crate::cli::Status;
 use crate::clock::monotonic_ns;
 use crate::exit::Exit;
 use crate::progress::Report;
-use crate::{print, proc};
+use crate::reach::in_time;
+use crate::{print, print_on, proc};
+use channels::{ChannelRow, Channels};
 
 /// Services send health once a second; a little more than that is listened for.
 const LISTEN: Duration = Duration::from_millis(1_300);
@@ -44,14 +48,29 @@ pub struct ServiceRow {
     pub nice: Option<i32>,
     /// Proportional memory, megabytes.
     pub pss_mb: Option<f64>,
+    /// The same by kind.
+    pub memory_mb: Option<MemoryRow>,
     /// How often it was started again.
     pub restarts: u32,
-    /// 99th percentile of a turn, milliseconds.
+    /// Median time of a turn of its loop, milliseconds.
+    pub turn_p50_ms: f64,
+    /// 99th percentile of that.
     pub turn_p99_ms: f64,
     /// Messages received, sent and lost.
     pub messages: [u64; 3],
     /// What went wrong last.
     pub last_error: String,
+}
+
+/// Proportional memory by kind, megabytes.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct MemoryRow {
+    /// Heap and stacks.
+    pub anonymous: f64,
+    /// The program and mapped files.
+    pub file: f64,
+    /// Channels.
+    pub shared: f64,
 }
 
 /// What is known of a system.
@@ -71,6 +90,8 @@ pub struct SystemReport {
     pub mission: Option<String>,
     /// Services.
     pub services: Vec<ServiceRow>,
+    /// Channels.
+    pub channels: Vec<ChannelRow>,
 }
 
 /// `vantage status`.
@@ -78,36 +99,51 @@ pub struct SystemReport {
 /// # Errors
 /// When there is no such system, or its bus cannot be joined.
 pub fn run(arguments: &Status) -> anyhow::Result<Exit> {
+    if !arguments.watch {
+        return print(&text(arguments, &reports(arguments)?)?);
+    }
+    // Until Ctrl-C. A system that ends meanwhile is listed no more.
+    loop {
+        let text = text(arguments, &reports(arguments)?)?;
+        let clear = if arguments.json { "" } else { CLEAR };
+        if !print_on(&format!("{clear}{text}"))? {
+            return Ok(Exit::Ok);
+        }
+    }
+}
+
+/// The terminal's cursor to its first line, and everything away.
+const CLEAR: &str = "\u{1b}[H\u{1b}[2J\u{1b}[3J";
+
+fn reports(arguments: &Status) -> anyhow::Result<Vec<SystemReport>> {
     let base = System::base_dir();
     let systems = match arguments.system.as_deref() {
         Some(name) => vec![System::find(&base, Some(name))?],
         None => System::list(&base),
     };
-    let mut reports = Vec::new();
-    for system in systems {
-        // Nothing runs in a dead system: joining it would only wait for what its dead left half-made.
-        reports.push(if system.is_alive() { look_at_in_time(system)? } else { blank(&system, "dead") });
+    if systems.is_empty() && arguments.watch {
+        std::thread::sleep(LISTEN);
     }
-    let text = if arguments.json {
-        serde_json::to_string_pretty(&reports)? + "\n"
-    } else if reports.is_empty() {
-        format!("nothing runs: no system in {}\n", base.display())
-    } else {
-        reports.iter().map(describe).collect()
-    };
-    print(&text)
+    // Nothing runs in a dead system: joining it would only wait for what its dead left half-made.
+    let look = |system: System| if system.is_alive() { look_at_in_time(system) } else { Ok(blank(&system, "dead")) };
+    systems.into_iter().map(look).collect()
 }
 
-/// Joining a bus waits for what a killed process left half-made until the keeper has removed it; without a keeper, for
-/// ever. The system is looked at from a thread of its own, which is left behind where that happens.
+fn text(arguments: &Status, reports: &[SystemReport]) -> anyhow::Result<String> {
+    Ok(if arguments.json {
+        let json =
+            if arguments.watch { serde_json::to_string(reports)? } else { serde_json::to_string_pretty(reports)? };
+        json + "\n"
+    } else if reports.is_empty() {
+        format!("nothing runs: no system in {}\n", System::base_dir().display())
+    } else {
+        reports.iter().map(|report| words::describe(report, arguments.channels)).collect()
+    })
+}
+
 fn look_at_in_time(system: System) -> anyhow::Result<SystemReport> {
-    let (sender, receiver) = sync_channel(1);
     let unreachable = blank(&system, "does not answer");
-    std::thread::Builder::new().name("status".to_owned()).spawn(move || {
-        // Nobody listens any more when it took too long.
-        sender.send(look_at(&system)).ok();
-    })?;
-    receiver.recv_timeout(LISTEN + PATIENCE).unwrap_or(Ok(unreachable))
+    Ok(in_time("status", LISTEN + PATIENCE, move || look_at(&system))?.unwrap_or(unreachable))
 }
 
 /// What is known of a system without joining it.
@@ -120,6 +156,7 @@ fn blank(system: &System, condition: &'static str) -> SystemReport {
         supervised: system.supervisor_pid != 0 && proc::is_alive(system.supervisor_pid),
         mission: None,
         services: Vec::new(),
+        channels: Vec::new(),
     }
 }
 
@@ -131,6 +168,7 @@ fn look_at(system: &System) -> anyhow::Result<SystemReport> {
     let mut last = bus.subscriber::<HealthLastChannel>()?;
     let mut fresh = bus.subscriber::<HealthChannel>()?;
     let mut missions = bus.subscriber::<MissionStateChannel>()?;
+    let mut channels = Channels::open(&bus)?;
     let mut known: Vec<(Health, Option<Instant>)> = Vec::new();
     let mut mission: Option<(u64, MissionState)> = None;
     let began = Instant::now();
@@ -146,10 +184,12 @@ fn look_at(system: &System) -> anyhow::Result<SystemReport> {
         if let Some(message) = missions.latest(0)? {
             mission = Some((message.stamp_ns(), *message.header()));
         }
+        channels.listen()?;
         std::thread::sleep(Duration::from_millis(20));
     }
     known.sort_by_key(|(health, _)| health.service);
     report.services = known.iter().filter_map(|(health, heard)| row(health, *heard)).collect();
+    report.channels = channels.rows(&bus)?;
     report.mission = mission.and_then(|(stamp_ns, state)| {
         let line = Report::of(&state, stamp_ns)?.line();
         Some(format!("{} {} in {}", unpack_text(&state.mission_id), line.trim_start(), unpack_text(&state.folder)))
@@ -177,8 +217,7 @@ fn row(health: &Health, heard: Option<Instant>) -> Option<ServiceRow> {
         return None;
     }
     #[expect(clippy::cast_precision_loss, reason = "figures for people")]
-    let (pss_mb, turn_p99_ms) =
-        (proc::pss_bytes(health.pid).map(|bytes| bytes as f64 / 1e6), health.turn_p99_ns as f64 / 1e6);
+    let (megabytes, milliseconds) = (|bytes: u64| bytes as f64 / 1e6, |ns: u64| ns as f64 / 1e6);
     Some(ServiceRow {
         service: service.to_string(),
         pid: health.pid,
@@ -187,66 +226,18 @@ fn row(health: &Health, heard: Option<Instant>) -> Option<ServiceRow> {
         age_s: proc::age_s(health.pid),
         heard_s: heard.map(|when| when.elapsed().as_secs_f64()),
         nice: proc::nice(health.pid),
-        pss_mb,
+        pss_mb: proc::pss_bytes(health.pid).map(megabytes),
+        memory_mb: proc::memory(health.pid).map(|memory| MemoryRow {
+            anonymous: megabytes(memory.anonymous),
+            file: megabytes(memory.file),
+            shared: megabytes(memory.shared),
+        }),
         restarts: health.restarts,
-        turn_p99_ms,
+        turn_p50_ms: milliseconds(health.turn_p50_ns),
+        turn_p99_ms: milliseconds(health.turn_p99_ns),
         messages: [health.received, health.sent, health.dropped],
         last_error: unpack_text(&health.last_error),
     })
-}
-
-fn describe(report: &SystemReport) -> String {
-    let mut text = format!("system {} in {}", report.system, report.folder);
-    match (report.supervisor_pid, report.supervised) {
-        (0, _) => text.push_str(", no supervisor\n"),
-        (pid, true) => writeln!(text, ", supervisor {pid}").unwrap_or(()),
-        (pid, false) => {
-            writeln!(text, ", supervisor {pid} is gone: `vantage doctor --clean` removes what is left").unwrap_or(())
-        }
-    }
-    match report.condition {
-        "dead" => {
-            text.push_str("dead: `vantage doctor --clean` removes it\n");
-            return text;
-        }
-        "does not answer" => {
-            text.push_str("does not answer: is its keeper running? (`vantage keeper --system NAME`)\n");
-            return text;
-        }
-        _ => {}
-    }
-    if let Some(mission) = &report.mission {
-        writeln!(text, "mission {mission}").ok();
-    }
-    if report.services.is_empty() {
-        text.push_str("no service was heard\n");
-        return text;
-    }
-    let header = format!(
-        "{:<10} {:>7} {:<9} {:>8} {:>8} {:>7} {:>4} {:>8} {:>9} {:>9} {:>9} {:>7}",
-        "service", "pid", "state", "restarts", "age", "heard", "nice", "memory", "turn p99", "received", "sent", "lost"
-    );
-    writeln!(text, "{header}").ok();
-    for row in &report.services {
-        let or_dash = |value: Option<String>| value.unwrap_or_else(|| "-".to_owned());
-        let [received, sent, lost] = row.messages;
-        writeln!(
-            text,
-            "{:<10} {:>7} {:<9} {:>8} {:>8} {:>7} {:>4} {:>8} {:>9} {received:>9} {sent:>9} {lost:>7}  {}",
-            row.service,
-            row.pid,
-            if row.alive { row.state.as_str() } else { "gone" },
-            row.restarts,
-            or_dash(row.age_s.map(|age| format!("{age:.0} s"))),
-            or_dash(row.heard_s.map(|age| format!("{age:.1} s"))),
-            or_dash(row.nice.map(|nice| nice.to_string())),
-            or_dash(row.pss_mb.map(|mb| format!("{mb:.1} MB"))),
-            format!("{:.2} ms", row.turn_p99_ms),
-            row.last_error
-        )
-        .ok();
-    }
-    text
 }
 
 #[cfg(test)]
@@ -290,10 +281,11 @@ mod tests {
             supervised: false,
             mission: None,
             services: vec![row_here, row_dead],
+            channels: Vec::new(),
         };
         let system = System::create(tempfile::tempdir_in("/dev/shm").expect("tmpfs").path(), "d", 0).expect("made");
-        assert!(describe(&blank(&system, "dead")).contains("doctor --clean"));
-        let text = describe(&report);
+        assert!(words::describe(&blank(&system, "dead"), false).contains("doctor --clean"));
+        let text = words::describe(&report, true);
         assert!(text.contains("world") && text.contains("gone") && text.contains("--clean"), "{text}");
     }
 }
