@@ -28,7 +28,7 @@ use shared_types::config::Config;
 use shared_types::config::trainer::DeclaredCost;
 use shared_types::messages::{CandidateScore, ScoreReply, ScoreStatus, ServiceState};
 use shared_types::payload::pack_text;
-use shared_types::service::{Context, HealthReport, Service, ServiceError, Step, StopAnswer};
+use shared_types::service::{Context, HealthReport, Service, ServiceError, Step, StopAnswer, last_exit};
 
 /// Answers kept for requests that are sent again.
 const ANSWERS_KEPT: usize = 8;
@@ -95,7 +95,10 @@ impl Scorer {
             0 => std::thread::available_parallelism().map_or(1, usize::from),
             n => n as usize,
         };
-        let mut renderer = Renderer::new(&config.scorer, threads)?;
+        let mut renderer = Renderer::new(&config.scorer, threads, last_exit().is_some()).map_err(|error| {
+            let expected = "expected one that `vantage doctor` lists, or scorer.backend=cpu";
+            ServiceError::Unusable(format!("scorer.backend, scorer.adapter: {error}; {expected}"))
+        })?;
         let ms_per_candidate = match config.scorer.ms_per_candidate {
             _ if !lockstep => 0.0,
             DeclaredCost::Fixed(ms) => ms,

@@ -19,11 +19,12 @@ pub struct Renderer {
 }
 
 impl Renderer {
-    /// The configured back end.
+    /// The configured back end. `restarted`: there was a scorer before this one, so that a GPU which is not there is gone, and
+    /// no mistake of the configuration: then the CPU scores.
     ///
     /// # Errors
     /// When it is not there, or the system refuses threads.
-    pub fn new(config: &ScorerConfig, threads: usize) -> Result<Self, BackendError> {
+    pub fn new(config: &ScorerConfig, threads: usize, restarted: bool) -> Result<Self, BackendError> {
         let kind = match config.backend {
             BackendWord::Auto => BackendKind::Auto,
             BackendWord::Cpu => BackendKind::Cpu,
@@ -32,7 +33,13 @@ impl Renderer {
         let adapter = Some(config.adapter.clone()).filter(|name| !name.is_empty());
         // Rendering adds nothing up out of order.
         let wanted = BackendOptions { kind, adapter, deterministic: false, threads };
-        let (backend, why_not_gpu) = Backend::new(&wanted)?;
+        let (backend, why_not_gpu) = match Backend::new(&wanted) {
+            Err(error) if restarted => {
+                tracing::warn!(%error, "the GPU is gone; the CPU scores");
+                Backend::new(&BackendOptions { kind: BackendKind::Cpu, adapter: None, ..wanted.clone() })?
+            }
+            chosen => chosen?,
+        };
         match why_not_gpu {
             Some(reason) => tracing::info!(%backend, %reason, "scoring"),
             None => tracing::info!(%backend, "scoring"),
@@ -67,10 +74,27 @@ impl Renderer {
         let fresh = if self.failures < 2 { Backend::new(&self.wanted).ok() } else { None };
         let (backend, _) = match fresh {
             Some(fresh) => fresh,
-            None => Backend::new(&BackendOptions { kind: BackendKind::Cpu, ..self.wanted.clone() })?,
+            None => Backend::new(&BackendOptions { kind: BackendKind::Cpu, adapter: None, ..self.wanted.clone() })?,
         };
         tracing::warn!(%backend, "scoring goes on");
         self.backend = backend;
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_gpu_that_is_not_there_is_a_mistake_at_first_and_gone_later() {
+        let config = ScorerConfig {
+            backend: BackendWord::Gpu,
+            adapter: "No Such GPU 9000".to_owned(),
+            ..ScorerConfig::default()
+        };
+        assert!(Renderer::new(&config, 1, false).unwrap_err().to_string().contains("No Such GPU 9000"));
+        let mut renderer = Renderer::new(&config, 1, true).unwrap();
+        assert!(renderer.backend().to_string().starts_with("cpu-"));
     }
 }

@@ -72,6 +72,7 @@ impl Ports {
             now_ns,
             datagrams,
             members_in: clock.members_in(),
+            repeats: u32::from(clock.deterministic()),
             ..ClockTick::default()
         };
         for (code, outs) in clock.outs() {

@@ -30,6 +30,7 @@ use shared_types::service::{Context, HealthReport, Service, ServiceError, Step, 
 use shared_types::{NS_PER_S, TICK_NS, ns_from_s};
 use splatting::Training;
 
+use crate::backend::{NoBackend, Past};
 use crate::ports::{Outcome, Ports};
 use crate::requests::{Requests, Verdict};
 use crate::round::Progress;
@@ -105,7 +106,12 @@ impl Trainer {
             n => n as usize,
         };
         let model_folder = folder.model_path();
-        let backend = backend::choose(&config.trainer, &model_folder, threads)?;
+        let last_exit = shared_types::service::last_exit();
+        let past = Past { flight_ns: config.mission.epoch_ns, last_exit: last_exit.as_deref() };
+        let backend = match backend::choose(&config.trainer, &model_folder, threads, past) {
+            Err(error @ NoBackend::Configured(_)) => return Err(ServiceError::Unusable(error.to_string()).into()),
+            chosen => chosen?,
+        };
         let mut training = Training::new(backend);
         let iterations_per_s = match config.trainer.iterations_per_s {
             _ if !lockstep => f64::INFINITY,
@@ -121,7 +127,6 @@ impl Trainer {
             Pace::OnDemand
         };
         let mut model = config.model.clone();
-        let last_exit = std::env::var(memory::LAST_EXIT).ok();
         model.max_gaussians = memory::most_gaussians(
             &model_folder,
             model.max_gaussians,

@@ -14,9 +14,6 @@ const FILE: &str = "memory.json";
 /// A smaller model shows nothing.
 const LEAST: u64 = 500;
 
-/// How the last process of this service ended, in the supervisor's words: `exit code 70`, `signal 9`.
-pub const LAST_EXIT: &str = "VANTAGE_LAST_EXIT";
-
 /// What is known of memory in a mission.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(default)]

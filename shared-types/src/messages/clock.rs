@@ -7,7 +7,7 @@ pub const MAX_SERVICES: usize = 16;
 
 payload! {
     /// `clock`: the present tick; a whole state, sent again every 100 ms of wall time.
-    pub struct ClockTick [104] {
+    pub struct ClockTick [112] {
         /// Which life of the simulator this is.
         pub incarnation: u64,
         /// Tick number; tick k is the instant k x 10 ms (plus `epoch_ns`).
@@ -20,6 +20,10 @@ payload! {
         pub members_in: u64,
         /// How often each member was found out; a member that sees its own count grow rejoins.
         pub outs: [u32; MAX_SERVICES],
+        /// 1 while a run like this repeats bit for bit: no member was ever out, no datagram was lost, nobody else flew.
+        pub repeats: u32,
+        /// Unused, zero.
+        pub reserved: u32,
     }
 }
 

@@ -72,6 +72,16 @@ impl ServiceName {
     }
 }
 
+/// Name of the variable by which a supervisor tells the next process of a service how the last one ended.
+pub const LAST_EXIT: &str = "VANTAGE_LAST_EXIT";
+
+/// How the last process of this service ended, in the supervisor's words (`exit code 70`, `signal 9`); `None` where there was
+/// none.
+#[must_use]
+pub fn last_exit() -> Option<String> {
+    std::env::var(LAST_EXIT).ok()
+}
+
 /// Why a service cannot go on.
 #[derive(Debug, thiserror::Error)]
 pub enum ServiceError {

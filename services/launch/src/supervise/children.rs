@@ -51,7 +51,7 @@ impl Starter {
             command.env("VANTAGE_LOG", &self.log_level);
         }
         if let Some(end) = last_end {
-            command.env("VANTAGE_LAST_EXIT", end);
+            command.env(shared_types::service::LAST_EXIT, end);
         }
         command.spawn()
     }

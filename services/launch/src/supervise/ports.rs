@@ -151,10 +151,10 @@ impl Ports {
         }
     }
 
-    /// How often members were found out of the simulated clock so far; `None` before its first tick.
+    /// Whether the simulated clock says that the run repeats bit for bit so far; `None` before its first tick.
     #[must_use]
-    pub fn outs(&self) -> Option<u32> {
-        self.tick.as_ref().map(|tick| tick.outs.iter().sum())
+    pub fn repeats(&self) -> Option<bool> {
+        self.tick.as_ref().map(|tick| tick.repeats == 1)
     }
 
     /// Tells the planner.

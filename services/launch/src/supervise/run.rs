@@ -156,8 +156,9 @@ struct Run<'a> {
     lacking: BTreeMap<ServiceName, String>,
     track: Track,
     score_ms: Vec<f64>,
-    /// Outs of the clock and restarts when the mission was over: what happens while everybody leaves is not its doing.
-    at_the_end: Option<(Option<u32>, BTreeMap<ServiceName, u32>)>,
+    /// Whether the clock's run repeats, and restarts, when the mission was over: what happens while everybody leaves is not its
+    /// doing.
+    at_the_end: Option<(Option<bool>, BTreeMap<ServiceName, u32>)>,
 }
 
 impl Run<'_> {
@@ -247,7 +248,7 @@ impl Run<'_> {
         let Some(report) = Report::of(state, stamp_ns) else { return };
         self.progress.show(&report);
         if matches!(report.phase, MissionPhase::Done | MissionPhase::Failed) && self.at_the_end.is_none() {
-            self.at_the_end = Some((self.ports.outs(), self.supervisor.restarts()));
+            self.at_the_end = Some((self.ports.repeats(), self.supervisor.restarts()));
         }
         self.tell_who_is_waited_for(report.phase == MissionPhase::Suspended);
         match report.phase {
@@ -296,8 +297,11 @@ impl Run<'_> {
 
     fn into_flight(self, config: &Config) -> Flight {
         let lockstep = config.clock.mode == ClockMode::Lockstep;
-        let (outs, restarts) = self.at_the_end.unwrap_or_else(|| (self.ports.outs(), self.supervisor.restarts()));
-        let deterministic = if lockstep { outs.map(|outs| outs == 0 && restarts.is_empty()) } else { Some(false) };
+        let (repeats, restarts) = self.at_the_end.unwrap_or_else(|| (self.ports.repeats(), self.supervisor.restarts()));
+        // Sums on a GPU come out in no order unless they are asked for one.
+        let unordered = trainer::backend::Record::read(&Path::new(&config.mission.folder).join("model")).unordered;
+        let deterministic =
+            if lockstep { repeats.map(|repeats| repeats && restarts.is_empty() && !unordered) } else { Some(false) };
         let mission_s =
             self.last.as_ref().map(|state| shared_types::s_from_ns(self.ended_ns.saturating_sub(state.started_ns)));
         Flight {

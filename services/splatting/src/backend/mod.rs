@@ -117,7 +117,7 @@ impl Backend {
             BackendKind::Cpu => (cpu()?, None),
             BackendKind::Gpu => (gpu()?, None),
             // A driver takes a while to load, even to find that there is nothing to drive.
-            BackendKind::Auto if wanted.adapter.is_none() && !gpu::may_exist() => (cpu()?, Some(GpuError::NoAdapter)),
+            BackendKind::Auto if wanted.adapter.is_none() && !gpu::may_exist() => (cpu()?, Some(GpuError::NoHardware)),
             BackendKind::Auto => match gpu() {
                 Ok(gpu) => (gpu, None),
                 // Who names an adapter wants that one.

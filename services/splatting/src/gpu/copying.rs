@@ -32,7 +32,7 @@ impl Engine {
         self.forget_copy();
         let Some(model) = &self.model else { return Ok(()) };
         if let Some(trainer) = &mut self.trainer {
-            trainer.submit(&self.context, &self.kernels, model, &self.keyframes)?;
+            trainer.submit(&self.context, &self.kernels, model)?;
         }
         let (parameters, bands) = (model.parameters.size(), model.bands.size());
         let bytes = parameters + bands;

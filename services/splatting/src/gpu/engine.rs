@@ -43,6 +43,8 @@ pub struct Options {
     pub deterministic: bool,
     /// Room for (tile, splat) pairs at first, for tests of what happens when it is not enough; 0: a good guess.
     pub pairs: u32,
+    /// Most bytes that keyframes take, of which the one not used for longest goes first; 0: 512 MB.
+    pub keyframe_bytes: u64,
 }
 
 /// The renderer and trainer on a GPU.
@@ -83,7 +85,7 @@ impl Engine {
             kernels,
             model: None,
             trainer: None,
-            keyframes: Keyframes::default(),
+            keyframes: Keyframes::new(options.keyframe_bytes),
             depths: Depths::default(),
             told: Vec::new(),
             copying: None,
@@ -275,7 +277,7 @@ impl Engine {
     pub fn finish(&mut self) -> Result<(), GpuError> {
         while self.trainer.as_ref().is_some_and(|trainer| !trainer.is_idle()) {
             if let (Some(trainer), Some(model)) = (&mut self.trainer, &self.model) {
-                trainer.submit(&self.context, &self.kernels, model, &self.keyframes)?;
+                trainer.submit(&self.context, &self.kernels, model)?;
             }
             self.collect(true)?;
         }

@@ -9,6 +9,12 @@ pub enum GpuError {
     /// No adapter at all.
     #[error("no GPU adapter was found: install a Vulkan driver, or set the back end to \"cpu\"")]
     NoAdapter,
+    /// No device node of a GPU: no driver was loaded to look further.
+    #[error(
+        "this machine has no GPU (no device node of one under /dev); drivers in software are a hundred times slower and were not \
+         looked for: one that is named with its adapter is taken"
+    )]
+    NoHardware,
     /// None of that name.
     #[error("no GPU adapter is named \"{wanted}\"; there are: {}", list(found))]
     NoSuchAdapter {

@@ -2,6 +2,7 @@
 
 use super::chain::Size;
 use super::job::{Job, View};
+use super::keyframe::Seen;
 use super::model::DeviceModel;
 use crate::densify::Noise;
 use crate::settings::TrainingSettings;
@@ -24,9 +25,9 @@ impl Counts {
 }
 
 /// An iteration that was asked for.
-#[derive(Clone, Copy)]
+#[derive(Clone)]
 pub(super) struct Iteration {
-    pub keyframe: u64,
+    pub keyframe: Seen,
     pub counts: Counts,
     pub view: View,
     pub settings: TrainingSettings,
@@ -37,9 +38,9 @@ pub(super) struct Iteration {
 }
 
 impl Iteration {
-    pub fn new(view: &TrainingView, settings: &TrainingSettings, observed: bool) -> Self {
+    pub fn new(view: &TrainingView, keyframe: Seen, settings: &TrainingSettings, observed: bool) -> Self {
         Self {
-            keyframe: view.id(),
+            keyframe,
             counts: Counts::new(view),
             view: View::new(view.camera(), &settings.render, 0.0),
             settings: *settings,

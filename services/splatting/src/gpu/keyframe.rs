@@ -19,13 +19,18 @@ const IGNORED: f32 = -1.0;
 const FREE: f32 = -2.0;
 const HAS_FOREGROUND: u32 = 1;
 const NEAR_FOREGROUND: u32 = 2;
-/// Most bytes that keyframes take; the one not used for longest goes first.
+/// Most bytes that keyframes take, unless the options say otherwise.
 const KEYFRAMES_MAX: u64 = 512 << 20;
 
-pub(super) struct DeviceKeyframe {
-    /// Bindings of the kernels of the loss, which see the same.
+/// Bindings of the kernels of the loss, which see the same of a keyframe. They keep its buffers alive.
+#[derive(Clone)]
+pub(super) struct Seen {
     pub ssim: BindGroup,
     pub loss: BindGroup,
+}
+
+pub(super) struct DeviceKeyframe {
+    pub seen: Seen,
     pub bytes: u64,
     /// When it was last used, to let go of the oldest.
     pub used: u64,
@@ -83,8 +88,10 @@ impl DeviceKeyframe {
         context.check()?;
         let seen = [&buffers[0], &buffers[1], &buffers[2]];
         Ok(Self {
-            ssim: kernels.ssim.bind_second(context, &seen),
-            loss: kernels.loss.bind_second(context, &seen),
+            seen: Seen {
+                ssim: kernels.ssim.bind_second(context, &seen),
+                loss: kernels.loss.bind_second(context, &seen),
+            },
             bytes: bytes.into_list().iter().map(|(_, bytes)| bytes).sum(),
             used: 0,
         })
@@ -92,36 +99,42 @@ impl DeviceKeyframe {
 }
 
 /// Keyframes by [`TrainingView::id`].
-#[derive(Default)]
 pub(super) struct Keyframes {
-    pub held: BTreeMap<u64, DeviceKeyframe>,
+    held: BTreeMap<u64, DeviceKeyframe>,
     /// How often one was asked for, to know which was used last.
     clock: u64,
+    /// Most bytes that they take.
+    most: u64,
 }
 
 impl Keyframes {
+    /// None yet, of at most so many bytes; 0: the default.
+    pub fn new(most: u64) -> Self {
+        Self { held: BTreeMap::new(), clock: 0, most: if most == 0 { KEYFRAMES_MAX } else { most } }
+    }
+
     pub fn bytes(&self) -> u64 {
         self.held.values().map(|keyframe| keyframe.bytes).sum()
     }
 
-    /// Makes sure that a keyframe is there, and room for it.
-    pub fn hold(&mut self, context: &Context, kernels: &Kernels, view: &TrainingView) -> Result<(), GpuError> {
+    /// What the loss needs of a keyframe; brings it to the GPU where it is not there, and makes room for it. Who was given one
+    /// that has to go may still use it.
+    pub fn hold(&mut self, context: &Context, kernels: &Kernels, view: &TrainingView) -> Result<Seen, GpuError> {
         self.clock += 1;
-        if !self.held.contains_key(&view.id()) {
-            let keyframe = DeviceKeyframe::upload(context, kernels, view)?;
-            while self.bytes() + keyframe.bytes > KEYFRAMES_MAX {
-                let oldest = self.held.iter().min_by_key(|(_, keyframe)| keyframe.used).map(|(&id, _)| id);
-                match oldest {
-                    // What was recorded keeps its buffers alive.
-                    Some(id) => self.held.remove(&id),
-                    None => break,
-                };
-            }
-            self.held.insert(view.id(), keyframe);
-        }
         if let Some(keyframe) = self.held.get_mut(&view.id()) {
             keyframe.used = self.clock;
+            return Ok(keyframe.seen.clone());
         }
-        Ok(())
+        let keyframe = DeviceKeyframe { used: self.clock, ..DeviceKeyframe::upload(context, kernels, view)? };
+        while self.bytes() + keyframe.bytes > self.most {
+            let oldest = self.held.iter().min_by_key(|(_, keyframe)| keyframe.used).map(|(&id, _)| id);
+            match oldest {
+                Some(id) => self.held.remove(&id),
+                None => break,
+            };
+        }
+        let seen = keyframe.seen.clone();
+        self.held.insert(view.id(), keyframe);
+        Ok(seen)
     }
 }

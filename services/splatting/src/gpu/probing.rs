@@ -32,9 +32,8 @@ impl Trainer {
         settings: &TrainingSettings,
     ) -> Result<[f64; STAGES], GpuError> {
         const STAMPS: u32 = 2 * STAGES as u32;
-        keyframes.hold(context, kernels, view)?;
-        let Some(keyframe) = keyframes.held.get(&view.id()) else { return Ok([f64::NAN; STAGES]) };
-        let iteration = Iteration::new(view, settings, false);
+        let keyframe = keyframes.hold(context, kernels, view)?;
+        let iteration = Iteration::new(view, keyframe, settings, false);
         context.queue.write_buffer(&self.jobs, 0, bytes_of(&job(self.chain.size, model, 0, &iteration)));
         context.queue.write_buffer(&self.views, 0, bytes_of(&iteration.view));
         let stamps = context.device.create_query_set(&wgpu::QuerySetDescriptor {
@@ -52,7 +51,7 @@ impl Trainer {
                 end_of_pass_write_index: Some(2 * at + 1),
             });
             let mut pass = encoder.begin_compute_pass(&ComputePassDescriptor { label: None, timestamp_writes });
-            self.record_stage(stage, &mut pass, kernels, keyframe, &[0, 0], Last::Step(&iteration));
+            self.record_stage(stage, &mut pass, kernels, &iteration.keyframe, &[0, 0], Last::Step(&iteration));
         }
         encoder.resolve_query_set(&stamps, 0..STAMPS, &resolved, 0);
         context.queue.submit([encoder.finish()]);
@@ -72,8 +71,8 @@ impl Trainer {
         view: &TrainingView,
         settings: &TrainingSettings,
     ) -> Result<Result<Gradients, u32>, GpuError> {
-        keyframes.hold(context, kernels, view)?;
-        let iteration = Iteration::new(view, settings, false);
+        let keyframe = keyframes.hold(context, kernels, view)?;
+        let iteration = Iteration::new(view, keyframe, settings, false);
         let out = context.storage("gradients", model.parameters.size())?;
         let bands_out = context.storage("gradients", model.bands.size())?;
         let group = kernels.gradient.bind(
@@ -94,9 +93,7 @@ impl Trainer {
         context.queue.write_buffer(&self.views, 0, bytes_of(&iteration.view));
         let mut encoder = context.encoder();
         let mut pass = encoder.begin_compute_pass(&ComputePassDescriptor::default());
-        if let Some(keyframe) = keyframes.held.get(&iteration.keyframe) {
-            self.record(&mut pass, kernels, keyframe, &[0, 0], Last::Gradient(&group));
-        }
+        self.record(&mut pass, kernels, &iteration.keyframe, &[0, 0], Last::Gradient(&group));
         drop(pass);
         context.queue.submit([encoder.finish()]);
         let [words, parameters, bands] =

@@ -12,7 +12,7 @@ use super::error::GpuError;
 use super::iteration::{Counts, Iteration, job};
 use super::job::{STRIDE, fold};
 use super::kernels::Kernels;
-use super::keyframe::{DeviceKeyframe, Keyframes};
+use super::keyframe::{Keyframes, Seen};
 use super::model::DeviceModel;
 use crate::densify::Noise;
 use crate::settings::{LossTerms, TrainingSettings};
@@ -218,10 +218,10 @@ impl Trainer {
         (view, observed): (&TrainingView, bool),
         settings: &TrainingSettings,
     ) -> Result<(), GpuError> {
-        keyframes.hold(context, kernels, view)?;
-        self.waiting.push(Iteration::new(view, settings, observed));
+        let keyframe = keyframes.hold(context, kernels, view)?;
+        self.waiting.push(Iteration::new(view, keyframe, settings, observed));
         if self.waiting.len() > ITERATIONS {
-            self.submit_batch(context, kernels, model, keyframes);
+            self.submit_batch(context, kernels, model);
         }
         context.check()
     }
@@ -243,15 +243,14 @@ impl Trainer {
         context: &Context,
         kernels: &Kernels,
         model: &DeviceModel,
-        keyframes: &Keyframes,
     ) -> Result<(), GpuError> {
         while !self.waiting.is_empty() {
-            self.submit_batch(context, kernels, model, keyframes);
+            self.submit_batch(context, kernels, model);
         }
         context.check()
     }
 
-    fn submit_batch(&mut self, context: &Context, kernels: &Kernels, model: &DeviceModel, keyframes: &Keyframes) {
+    fn submit_batch(&mut self, context: &Context, kernels: &Kernels, model: &DeviceModel) {
         let rest = self.waiting.split_off(self.waiting.len().min(ITERATIONS));
         let iterations = std::mem::replace(&mut self.waiting, rest);
         for (slot, iteration) in iterations.iter().enumerate() {
@@ -263,9 +262,7 @@ impl Trainer {
         let mut pass = encoder.begin_compute_pass(&ComputePassDescriptor::default());
         for (slot, iteration) in iterations.iter().enumerate() {
             let offset = (STRIDE * slot as u64) as u32;
-            if let Some(keyframe) = keyframes.held.get(&iteration.keyframe) {
-                self.record(&mut pass, kernels, keyframe, &[offset, offset], Last::Step(iteration));
-            }
+            self.record(&mut pass, kernels, &iteration.keyframe, &[offset, offset], Last::Step(iteration));
         }
         drop(pass);
         let bytes = self.ring.size();
@@ -281,7 +278,7 @@ impl Trainer {
         &self,
         pass: &mut ComputePass<'_>,
         kernels: &Kernels,
-        keyframe: &DeviceKeyframe,
+        keyframe: &Seen,
         offsets: &[u32; 2],
         last: Last<'_>,
     ) {
@@ -295,7 +292,7 @@ impl Trainer {
         stage: Stage,
         pass: &mut ComputePass<'_>,
         kernels: &Kernels,
-        keyframe: &DeviceKeyframe,
+        keyframe: &Seen,
         offsets: &[u32; 2],
         last: Last<'_>,
     ) {

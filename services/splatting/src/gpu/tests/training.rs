@@ -100,6 +100,25 @@ fn a_hundred_iterations_end_where_the_cpu_ends() {
     });
 }
 
+/// Keyframes that have to make room while iterations that need them are waiting.
+#[test]
+fn fewer_keyframes_than_views_fit_and_nothing_is_left_out() {
+    let Some(options) = options() else { return skipped("fewer_keyframes_than_views_fit_and_nothing_is_left_out") };
+    let (start, views) = task(200, (48, 40), 0);
+    let run = |keyframe_bytes: u64| {
+        let mut engine = Engine::new(&Options { keyframe_bytes, deterministic: true, ..options.clone() }).unwrap();
+        let (model, _, terms) = on_gpu(&mut engine, &start, &views, 40);
+        let kept = engine.bytes().into_iter().find(|(what, _)| *what == "keyframes").unwrap().1;
+        (model, terms, kept)
+    };
+    let (all, terms, bytes) = run(0);
+    // Room for one and a half of the four.
+    let (few, few_terms, few_bytes) = run(bytes * 3 / 8);
+    assert!(few_bytes <= bytes * 3 / 8 && few_bytes > 0, "{few_bytes} of {bytes}");
+    assert_eq!((terms.len(), few_terms.len()), (40, 40));
+    assert!(terms == few_terms && all == few, "the same iterations, in the same order");
+}
+
 #[test]
 fn the_first_step_moves_every_parameter_as_on_the_cpu() {
     with_engine("the_first_step_moves_every_parameter_as_on_the_cpu", |engine| {

@@ -1,0 +1,149 @@
+//! The services as systemd has them: units that it understands and that touch little, and what a service tells it.
+
+#![allow(clippy::expect_used, clippy::panic, clippy::unwrap_used, reason = "a test or bench fails by panicking")]
+
+mod common;
+
+use std::os::unix::net::UnixDatagram;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::time::{Duration, Instant};
+
+use common::{kill, vantage};
+use shared_types::folder::MissionFolder;
+use shared_types::system::System;
+
+/// How far a unit may be exposed, by systemd's own count.
+const MOST_EXPOSED: f64 = 2.0;
+
+fn units() -> Vec<PathBuf> {
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("deploy/systemd");
+    let of_kind = |path: &PathBuf| path.extension().is_some_and(|kind| kind == "service" || kind == "target" || kind == "slice");
+    let mut units: Vec<PathBuf> =
+        std::fs::read_dir(folder).expect("units").flatten().map(|entry| entry.path()).filter(of_kind).collect();
+    units.sort();
+    units
+}
+
+/// The units in a folder of their own, with the binary under test instead of the installed one.
+fn installed(folder: &Path) -> Vec<PathBuf> {
+    let install = |unit: PathBuf| {
+        let text = std::fs::read_to_string(&unit).expect("a unit");
+        let path = folder.join(unit.file_name().expect("a name"));
+        std::fs::write(&path, text.replace("/usr/bin/vantage", env!("CARGO_BIN_EXE_vantage"))).expect("written");
+        path
+    };
+    units().into_iter().map(install).collect()
+}
+
+#[test]
+fn systemd_understands_every_unit_and_finds_little_exposed() {
+    let test = "systemd_understands_every_unit_and_finds_little_exposed";
+    let there = Command::new("systemd-analyze").arg("--version").stdout(Stdio::null()).stderr(Stdio::null()).status();
+    if there.is_err() {
+        println!("{test}: skipped, no systemd-analyze");
+        return;
+    }
+    let folder = tempfile::tempdir().expect("folder");
+    let units = installed(folder.path());
+    assert_eq!(units.len(), 10 + 2 + 1, "services, targets, the slice");
+    let output = Command::new("systemd-analyze")
+        .args(["verify", "--man=no"])
+        .args(&units)
+        .env("SYSTEMD_UNIT_PATH", format!("{}:", folder.path().display()))
+        .output()
+        .expect("systemd-analyze runs");
+    // It ends well even with an unknown key; what it says counts.
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success() && said.is_empty(), "{said}");
+    for unit in units.iter().filter(|unit| unit.extension().is_some_and(|kind| kind == "service")) {
+        let output = Command::new("systemd-analyze").args(["security", "--offline=yes"]).arg(unit).output().expect("runs");
+        let text = String::from_utf8_lossy(&output.stdout);
+        let line = text.lines().rev().find(|line| line.contains("Overall exposure level")).expect("a verdict");
+        let level: f64 = line.split_whitespace().filter_map(|word| word.parse().ok()).next_back().expect("a number");
+        println!("{}: {level}", unit.display());
+        assert!(level <= MOST_EXPOSED, "{line}");
+    }
+}
+
+/// A service under a supervisor that listens.
+struct Told {
+    child: Child,
+    socket: UnixDatagram,
+    began: Instant,
+}
+
+impl Told {
+    fn start(folder: &Path, service: &str, system: &str, sets: &[String]) -> Self {
+        let path = folder.join(format!("{service}.socket"));
+        let socket = UnixDatagram::bind(&path).expect("a socket");
+        socket.set_read_timeout(Some(Duration::from_secs(20))).expect("a timeout");
+        let child = vantage()
+            .args([service, "--system", system])
+            .args(sets.iter().flat_map(|set| ["--set", set]))
+            .env("NOTIFY_SOCKET", &path)
+            .env("WATCHDOG_USEC", "10000000")
+            .stdin(Stdio::null())
+            .stdout(Stdio::null())
+            .stderr(Stdio::null())
+            .spawn()
+            .expect("vantage starts");
+        Self { child, socket, began: Instant::now() }
+    }
+
+    /// What it says next; `None` where it says nothing for so long.
+    fn next(&self, patience: Duration) -> Option<String> {
+        self.socket.set_read_timeout(Some(patience)).expect("a timeout");
+        let mut bytes = [0; 4096];
+        let count = self.socket.recv(&mut bytes).ok()?;
+        Some(String::from_utf8_lossy(&bytes[..count]).trim().to_owned())
+    }
+
+    fn wait_for(&self, word: &str) -> Duration {
+        let began = Instant::now();
+        while let Some(said) = self.next(Duration::from_secs(20)) {
+            if said == word {
+                return self.began.elapsed();
+            }
+            assert!(began.elapsed() < Duration::from_secs(30), "no {word}, last {said}");
+        }
+        panic!("no {word}");
+    }
+
+    fn end(mut self) {
+        kill(self.child.id(), "TERM");
+        self.wait_for("STOPPING=1");
+        assert!(self.child.wait().expect("ended").success());
+    }
+}
+
+/// Ready, alive from its loop, silent when it stands, leaving.
+#[test]
+fn every_service_tells_its_supervisor() {
+    let folder = tempfile::tempdir().expect("folder");
+    let mission = folder.path().join("mission");
+    MissionFolder::create(&mission).expect("a mission folder");
+    let system = format!("told-{}", std::process::id());
+    let sets = vec!["clock.mode=wall".to_owned(), format!("mission.folder={}", mission.display())];
+    let keeper = Told::start(folder.path(), "keeper", &system, &sets);
+    let ready = keeper.wait_for("READY=1");
+    println!("keeper: ready after {} ms", ready.as_millis());
+    for service in ["px4-link", "camera", "trainer", "scorer", "planner", "recorder"] {
+        let told = Told::start(folder.path(), service, &system, &[]);
+        println!("{service}: ready after {} ms", told.wait_for("READY=1").as_millis());
+        told.wait_for("WATCHDOG=1");
+        told.wait_for("WATCHDOG=1");
+        told.end();
+    }
+    // Not from a side thread: a process that stands says nothing.
+    let told = Told::start(folder.path(), "scorer", &system, &[]);
+    told.wait_for("WATCHDOG=1");
+    kill(told.child.id(), "STOP");
+    while told.next(Duration::from_millis(300)).is_some() {}
+    assert_eq!(told.next(Duration::from_secs(3)), None, "it stands");
+    kill(told.child.id(), "CONT");
+    told.wait_for("WATCHDOG=1");
+    told.end();
+    keeper.end();
+    System::find(&System::base_dir(), Some(&system)).expect("found").remove_if_dead().expect("removed");
+}
