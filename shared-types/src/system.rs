@@ -19,6 +19,9 @@ use crate::storage;
 /// Where iceoryx2 keeps shared memory.
 pub const SHARED_MEMORY_DIR: &str = "/dev/shm";
 
+/// Where systems of system services are.
+pub const ONBOARD_DIR: &str = "/run/vantage";
+
 /// The root path and names must fit a unix socket's path (107 bytes), of which iceoryx2 needs about 42.
 const LONGEST_ROOT: usize = 64;
 
@@ -119,7 +122,7 @@ impl System {
     #[must_use]
     pub fn base_dir() -> PathBuf {
         if std::env::var_os("RUNTIME_DIRECTORY").is_some() {
-            return PathBuf::from("/run/vantage");
+            return PathBuf::from(ONBOARD_DIR);
         }
         match std::env::var_os("XDG_RUNTIME_DIR").map(PathBuf::from) {
             Some(dir) if dir.is_dir() => dir.join("vantage"),
@@ -261,6 +264,10 @@ impl System {
             Some(name) => Self::open(&base.join(name)),
             None => {
                 let mut systems = Self::list(base);
+                if systems.is_empty() {
+                    // A user who looks at what runs as a system service.
+                    systems = Self::list(Path::new(ONBOARD_DIR));
+                }
                 match (systems.len(), systems.pop()) {
                     (1, Some(system)) => Ok(system),
                     (found, last) => {

@@ -237,6 +237,17 @@ pub fn leftovers(before: &[PathBuf]) -> Vec<PathBuf> {
     system_files().into_iter().filter(|path| !before.contains(path)).collect()
 }
 
+/// Of these, what belongs to no system that is alive: others may have been started meanwhile.
+pub fn of_no_living_system(files: Vec<PathBuf>) -> Vec<PathBuf> {
+    let living = shared_types::system::System::list(&shared_types::system::System::base_dir());
+    let living: Vec<_> = living.into_iter().filter(shared_types::system::System::is_alive).collect();
+    let is_theirs = |path: &PathBuf| {
+        let name = path.file_name().and_then(|name| name.to_str()).unwrap_or_default();
+        living.iter().any(|system| *path == system.runtime_dir || name.starts_with(&system.prefix))
+    };
+    files.into_iter().filter(|path| !is_theirs(path)).collect()
+}
+
 /// Everything of any system: its folders, and files in shared memory with a system's prefix.
 pub fn system_files() -> Vec<PathBuf> {
     let base = shared_types::system::System::base_dir();

@@ -19,6 +19,7 @@ mod record;
 mod starts;
 mod table;
 
+use std::collections::BTreeSet;
 use std::path::PathBuf;
 use std::process::ExitCode;
 use std::time::{Duration, Instant};
@@ -103,19 +104,20 @@ fn main() -> ExitCode {
     }
     let mut results = Results::open(&options.out);
     let began = Instant::now();
-    let done_before = results.missions.len() as u64;
-    for index in done_before..options.missions {
+    let flown: BTreeSet<u64> = results.missions.iter().map(|mission| mission.mission).collect();
+    let left: Vec<u64> = (0..options.missions).filter(|index| !flown.contains(index)).collect();
+    for (done, index) in left.iter().copied().enumerate() {
         if began.elapsed() > Duration::from_secs_f64(3600.0 * options.hours) {
             break;
         }
         let outcome = mission::fly(&options, index);
-        let each = began.elapsed().as_secs_f64() / (index + 1 - done_before) as f64;
+        let each = began.elapsed().as_secs_f64() / (done + 1) as f64;
         println!(
             "mission {index}: {} faults, {}, {:.1} s; {:.0} min left",
             outcome.faults.len(),
             outcome.mission.verdict(),
             outcome.mission.wall_s,
-            each * (options.missions - index - 1) as f64 / 60.0
+            each * (left.len() - done - 1) as f64 / 60.0
         );
         results.add(outcome);
     }

@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use splatting::order::Random;
 
 use crate::common::watch::{Moment, Watch};
-use crate::common::{Flight, kill, runs, system_files, vantage};
+use crate::common::{Flight, kill, leftovers, of_no_living_system, runs, system_files, vantage};
 use crate::judge::judge;
 use crate::load::{self, Loads, Meter};
 use crate::record::{Fault, Flown, Mission};
@@ -215,7 +215,7 @@ impl Flying<'_> {
             clearance_m: None,
             largest_step_m: self.largest_step_m,
             collisions: 0,
-            leftovers: system_files().into_iter().filter(|path| !before.contains(path)).count(),
+            leftovers: of_no_living_system(leftovers(before)).len(),
             wall_s: began.elapsed().as_secs_f64(),
             loads: core::mem::take(&mut self.loads),
             shared_memory_bytes: load::shared_memory_bytes(),

@@ -30,6 +30,13 @@ pub enum Command {
     /// Show what runs, since when, restarts, memory and ages of the last messages.
     #[command(after_help = "Example: vantage status --watch --channels")]
     Status(Status),
+    /// Prepare a mission whose services somebody else starts, such as systemd: folder, and the system that they join.
+    #[command(after_help = "Example: vantage prepare --config /etc/vantage/vantage.toml --system onboard\n\
+        Goes on with the newest mission where that was cut off.")]
+    Prepare(Prepare),
+    /// Begin a mission that waits for it (planner.autostart = false).
+    #[command(after_help = "Example: vantage start")]
+    Start(Order),
     /// Tell a flying mission to return, land and save.
     #[command(after_help = "Example: vantage stop --system fly-4711")]
     Stop(Order),
@@ -184,6 +191,17 @@ pub struct Resume {
     /// Print the result as JSON (report/metrics.json) instead of a table.
     #[arg(long)]
     pub json: bool,
+}
+
+/// Arguments of `prepare`.
+#[derive(Debug, Clone, Args)]
+pub struct Prepare {
+    /// Configuration.
+    #[command(flatten)]
+    pub settings: Settings,
+    /// Name of the system to make; none of that name may run.
+    #[arg(long, value_name = "NAME", default_value = "onboard")]
+    pub system: String,
 }
 
 /// Arguments of `status`.

@@ -109,8 +109,7 @@ fn configure(arguments: &Fly) -> anyhow::Result<Config> {
         });
     }
     let mut config = load(&layers)?;
-    check_camera(&config)?;
-    check_object(&config)?;
+    check(&config)?;
     config.mission.preset.clone_from(&arguments.settings.preset);
     config.mission.version = env!("CARGO_PKG_VERSION").to_owned();
     if config.mission.id.is_empty() {
@@ -135,6 +134,15 @@ fn configure(arguments: &Fly) -> anyhow::Result<Config> {
         return Err(Refusal::usage(problem));
     }
     Ok(config)
+}
+
+/// Refuses what could not be flown, before anything is made.
+///
+/// # Errors
+/// No source of images, or an object that the world could not show.
+pub(crate) fn check(config: &Config) -> anyhow::Result<()> {
+    check_camera(config)?;
+    check_object(config)
 }
 
 /// Refuses a vehicle that nothing here can see with: it would take off, take no view and land.
@@ -179,7 +187,7 @@ fn set_text(section: &str, key: &str, value: &str) -> Layer {
     }
 }
 
-fn utf8(path: &Path) -> anyhow::Result<String> {
+pub(crate) fn utf8(path: &Path) -> anyhow::Result<String> {
     path.to_str()
         .map(str::to_owned)
         .ok_or_else(|| Refusal::usage(format!("{}: expected a path in UTF-8", path.display())))

@@ -2,7 +2,7 @@
 //!
 //! - [`cli`], [`settings`]: arguments, and the configuration they resolve to;
 //! - [`service`]: one process of a mission in the foreground;
-//! - [`fly`], [`supervise`], [`progress`], [`summary`]: a whole mission;
+//! - [`fly`], [`supervise`], [`progress`], [`summary`]: a whole mission; [`prepare`]: one that another supervisor runs;
 //! - [`evaluate`], [`export`]: what a mission folder is worth, and how it leaves Vantage;
 //! - [`replay`]: services alone on what was recorded;
 //! - [`reconstruct`]: offline training on a mission folder or another dataset;
@@ -22,6 +22,7 @@ pub mod fly;
 pub mod instance;
 pub mod machine_check;
 pub mod order;
+pub mod prepare;
 pub mod proc;
 pub mod progress;
 pub mod reach;
@@ -90,6 +91,8 @@ fn run(command: &Command) -> anyhow::Result<Exit> {
         Command::Fly(arguments) => fly::fly(arguments),
         Command::Resume(arguments) => fly::resume(arguments),
         Command::Status(arguments) => status::run(arguments),
+        Command::Prepare(arguments) => prepare::run(arguments),
+        Command::Start(arguments) => order::run(MissionCommand::Start, arguments),
         Command::Stop(arguments) => order::run(MissionCommand::Stop, arguments),
         Command::Land(arguments) => order::run(MissionCommand::Land, arguments),
         Command::Abort(arguments) => order::run(MissionCommand::Abort, arguments),

@@ -142,7 +142,7 @@ fn dispatch(name: ServiceName, mut context: Context, sweeping: Option<keeper::Sw
         },
         ServiceName::Simulator => {
             // Alone (for other ground stations, or to try something), it runs free; in a mission it waits for its members.
-            let members = if context.supervised { ServiceName::members(&context.config) } else { Vec::new() };
+            let members = if in_a_mission(&context) { ServiceName::members(&context.config) } else { Vec::new() };
             simulator::run(&mut context, &members).map_err(|error| match error.exit_code() {
                 64 => Refusal::usage(error.to_string()),
                 69 => Refusal::missing(error.to_string()),
@@ -152,7 +152,7 @@ fn dispatch(name: ServiceName, mut context: Context, sweeping: Option<keeper::Sw
         ServiceName::World => world::run(context),
         ServiceName::Px4Link => px4_link::run(context),
         ServiceName::Camera => {
-            if context.supervised && context.config.link.is_local() {
+            if in_a_mission(&context) && context.config.link.is_local() {
                 await_world(&context)?;
             }
             camera::run(context)
@@ -163,6 +163,11 @@ fn dispatch(name: ServiceName, mut context: Context, sweeping: Option<keeper::Sw
         ServiceName::Recorder => recorder::run(context),
         ServiceName::Command | ServiceName::Launch => Err(Refusal::usage(format!("{name} is no service"))),
     }
+}
+
+/// Whether the others of a mission are there, or will be: under launch, or under another supervisor that was prepared for.
+fn in_a_mission(context: &Context) -> bool {
+    context.supervised || !context.config.mission.folder.is_empty()
 }
 
 /// How long the camera waits for the world's scene before it goes on without.

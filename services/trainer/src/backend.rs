@@ -176,11 +176,7 @@ mod tests {
     const FIRST: Past<'_> = Past { flight_ns: 0, last_exit: None };
 
     fn gone() -> TrainerConfig {
-        TrainerConfig {
-            backend: BackendWord::Gpu,
-            adapter: "No Such GPU 9000".to_owned(),
-            ..TrainerConfig::default()
-        }
+        TrainerConfig { backend: BackendWord::Gpu, adapter: "No Such GPU 9000".to_owned(), ..TrainerConfig::default() }
     }
 
     fn trained_on_a_gpu(folder: &Path) {

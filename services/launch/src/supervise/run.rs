@@ -196,9 +196,10 @@ impl Run<'_> {
                 if !self.supervisor.is_ending() {
                     self.progress
                         .say(&format!("{service} ended ({how}); see {}", self.children.log_path(service).display()));
-                }
-                if !words.is_empty() {
-                    self.last_words = Some(words);
+                    // Of those that are told to end because of it, nobody asks.
+                    if !words.is_empty() {
+                        self.last_words = Some(words);
+                    }
                 }
             }
             self.event(&Event::Exited { service, code });

@@ -238,12 +238,7 @@ impl Trainer {
     }
 
     /// Submits what is waiting.
-    pub fn submit(
-        &mut self,
-        context: &Context,
-        kernels: &Kernels,
-        model: &DeviceModel,
-    ) -> Result<(), GpuError> {
+    pub fn submit(&mut self, context: &Context, kernels: &Kernels, model: &DeviceModel) -> Result<(), GpuError> {
         while !self.waiting.is_empty() {
             self.submit_batch(context, kernels, model);
         }
