@@ -252,12 +252,12 @@ pub struct Tap {
 }
 
 fn not_negative(text: &str) -> Result<f64, String> {
-    let value: f64 = text.parse().map_err(|_| "expected a number".to_owned())?;
+    let value: f64 = text.parse().map_err(|error: core::num::ParseFloatError| error.to_string())?;
     if value.is_finite() && value >= 0.0 { Ok(value) } else { Err("expected a number of 0 or more".to_owned()) }
 }
 
 fn positive(text: &str) -> Result<f64, String> {
-    let value: f64 = text.parse().map_err(|_| "expected a number".to_owned())?;
+    let value: f64 = text.parse().map_err(|error: core::num::ParseFloatError| error.to_string())?;
     if value.is_finite() && value > 0.0 { Ok(value) } else { Err("expected a number above 0".to_owned()) }
 }
 
