@@ -73,6 +73,8 @@ pub fn resume(arguments: &Resume) -> anyhow::Result<Exit> {
 /// Nothing of a mission that is over is flown again: its figures are shown, and measured where a kill came before that.
 fn already_over(folder: &MissionFolder, config: &Config, usable: bool, json: bool) -> anyhow::Result<Exit> {
     say(&format!("the mission in {} is over; `vantage fly` flies a new one", folder.root().display()));
+    // Its launch may have been killed while it removed the system.
+    sweep_dead_systems();
     if !usable {
         return Ok(Exit::Failed);
     }
