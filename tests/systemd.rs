@@ -122,6 +122,13 @@ impl Told {
     }
 }
 
+impl Drop for Told {
+    fn drop(&mut self) {
+        drop(self.child.kill());
+        drop(self.child.wait());
+    }
+}
+
 /// Ready, alive from its loop, silent when it stands, leaving.
 #[test]
 fn every_service_tells_its_supervisor() {
@@ -163,6 +170,18 @@ fn every_service_tells_its_supervisor() {
     System::find(&System::base_dir(), Some(&system)).expect("found").remove_if_dead().expect("removed");
 }
 
+/// Processes that do not outlive a test that fails.
+struct Children(Vec<(&'static str, Child)>);
+
+impl Drop for Children {
+    fn drop(&mut self) {
+        for (_, child) in &mut self.0 {
+            drop(child.kill());
+            drop(child.wait());
+        }
+    }
+}
+
 /// The same services under another supervisor than launch: prepared, and started in an order that is nobody's.
 /// The journal is that of `vantage fly`, word for word.
 #[test]
@@ -193,20 +212,20 @@ fn another_supervisor_flies_the_same_mission() {
         command.args([service, "--system", &system]).stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null());
         command.spawn().expect("vantage starts")
     };
-    let mut children: Vec<(&str, Child)> = order.iter().map(|service| (*service, start(service))).collect();
+    let mut children = Children(order.iter().map(|service| (*service, start(service))).collect());
     let began = Instant::now();
     let is_over = || common::journal(&folder).iter().any(|entry| entry["event"] == "over");
     while !is_over() {
         assert!(began.elapsed() < common::LONGEST, "not over: {:?}", common::journal(&folder).last());
-        for (service, child) in &mut children {
+        for (service, child) in &mut children.0 {
             if let Some(status) = child.try_wait().expect("looked at") {
                 panic!("{service} ended: {status}");
             }
         }
         std::thread::sleep(Duration::from_millis(50));
     }
-    children.iter().for_each(|(_, child)| kill(child.id(), "TERM"));
-    for (service, child) in &mut children {
+    children.0.iter().for_each(|(_, child)| kill(child.id(), "TERM"));
+    for (service, child) in &mut children.0 {
         assert!(child.wait().expect("ended").success(), "{service}");
     }
     let journal = |folder: &Path| std::fs::read_to_string(folder.join("journal.jsonl")).expect("a journal");
