@@ -4,7 +4,7 @@ use std::time::{Duration, Instant};
 
 use serde::Serialize;
 use shared_types::bus::{Bus, BusError, Census, Subscriber};
-use shared_types::channel::{Channel, ChannelVisitor, visit_all};
+use shared_types::channel::{Channel, ChannelVisitor, FrameChannel, visit_all};
 
 /// What is known of a channel.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -12,8 +12,9 @@ pub struct ChannelRow {
     /// Who is on it, and its memory.
     #[serde(flatten)]
     pub census: Census,
-    /// Messages per second of wall time, those included that came too fast to be looked at.
-    pub rate_hz: f64,
+    /// Messages per second of wall time, those included that came too fast to be looked at; absent where nobody listened.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub rate_hz: Option<f64>,
     /// Wall time since the last message, seconds; absent when none came while listening.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub heard_s: Option<f64>,
@@ -27,24 +28,30 @@ trait Listened {
 }
 
 struct Ear<C: Channel> {
-    subscriber: Subscriber<C>,
+    /// None on the stream of images, which the camera makes for its readers only: looking would make it.
+    subscriber: Option<Subscriber<C>>,
     last: Option<Instant>,
 }
 
 impl<C: Channel> Listened for Ear<C> {
     fn listen(&mut self) -> Result<(), BusError> {
-        if self.subscriber.latest(u64::MAX)?.is_some() {
+        if let Some(subscriber) = &mut self.subscriber
+            && subscriber.latest(u64::MAX)?.is_some()
+        {
             self.last = Some(Instant::now());
         }
         Ok(())
     }
 
     fn row(&self, bus: &Bus, listened: Duration) -> Result<ChannelRow, BusError> {
+        let mut census = bus.census::<C>()?;
+        // This command's own reader does not count.
+        census.subscribers = census.subscribers.saturating_sub(usize::from(self.subscriber.is_some()));
         #[expect(clippy::cast_precision_loss, reason = "a figure for people")]
-        let messages = (self.subscriber.received() + self.subscriber.lost()) as f64;
+        let per_s = |messages: u64| messages as f64 / listened.as_secs_f64();
         Ok(ChannelRow {
-            census: bus.census::<C>()?,
-            rate_hz: messages / listened.as_secs_f64(),
+            census,
+            rate_hz: self.subscriber.as_ref().map(|heard| per_s(heard.received() + heard.lost())),
             heard_s: self.last.map(|last| last.elapsed().as_secs_f64()),
         })
     }
@@ -64,7 +71,8 @@ struct Opening<'a> {
 
 impl ChannelVisitor for Opening<'_> {
     fn visit<C: Channel>(&mut self) {
-        match self.bus.subscriber::<C>() {
+        let stream = C::NAME == FrameChannel::NAME;
+        match if stream { Ok(None) } else { self.bus.subscriber::<C>().map(Some) } {
             Ok(subscriber) => self.ears.push(Box::new(Ear { subscriber, last: None })),
             Err(error) => self.failed = Some(error),
         }
@@ -93,16 +101,12 @@ impl Channels {
         self.ears.iter_mut().try_for_each(|ear| ear.listen())
     }
 
-    /// What was heard. This command's own reader does not count.
+    /// What was heard.
     ///
     /// # Errors
     /// When a channel is broken.
     pub fn rows(&self, bus: &Bus) -> Result<Vec<ChannelRow>, BusError> {
         let listened = self.began.elapsed();
-        let without_us = |mut row: ChannelRow| {
-            row.census.subscribers = row.census.subscribers.saturating_sub(1);
-            row
-        };
-        self.ears.iter().map(|ear| ear.row(bus, listened).map(without_us)).collect()
+        self.ears.iter().map(|ear| ear.row(bus, listened)).collect()
     }
 }

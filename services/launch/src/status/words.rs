@@ -93,7 +93,7 @@ fn describe_channels(report: &SystemReport, text: &mut String) {
             census.subscribers,
             census.queue,
             format!("{megabytes:.2} MB"),
-            format!("{:.1} /s", row.rate_hz),
+            row.rate_hz.map_or_else(|| "-".to_owned(), |rate| format!("{rate:.1} /s")),
             row.heard_s.map_or_else(|| "-".to_owned(), |age| format!("{age:.1} s"))
         )
         .ok();
