@@ -229,7 +229,7 @@ fn a_finished_mission_stops_in_order() {
     let (stopped, outcome) = run_out(&mut supervisor, 9_000, actions);
     assert_eq!(outcome, Outcome::Done);
     assert_eq!(stopped.len(), START_ORDER.len());
-    assert_eq!(stopped[5..], [Px4Link, Simulator, Keeper]);
+    assert_eq!(stopped[5..], [Px4Link, Recorder, Simulator, Keeper]);
 }
 
 #[test]
