@@ -176,8 +176,8 @@ mod tests {
         }
         // Half, 85 % and all of it are taken; one of each was too much.
         let counts = [10, 7, 3];
+        assert!(Priority::ALL.into_iter().all(|priority| !queue.has_room(priority)));
         for (priority, count) in Priority::ALL.into_iter().zip(counts) {
-            assert!(!queue.has_room(priority));
             for _ in 0..count {
                 let Taken::Sample(taken) = queue.take(Duration::ZERO) else { panic!("{priority:?}") };
                 assert_eq!(taken.priority, priority);
