@@ -135,6 +135,14 @@ fn the_same_seed_writes_the_same_journal() {
 }
 
 #[test]
+fn a_px4_link_that_dies_often_ends_no_mission() {
+    let link_restarts = (2000..9000).step_by(700).collect();
+    let (world, end) = fly(short(), Faults { link_restarts, ..Faults::default() });
+    assert_eq!((end, world.keyframes()), (EndReason::Complete, 14));
+    assert!(world.captures.values().all(|&count| count == 1));
+}
+
+#[test]
 fn failed_captures_are_tried_again() {
     let (world, end) = fly(short(), Faults { failing_capture: 5, ..Faults::default() });
     assert_eq!((end, world.keyframes()), (EndReason::Complete, 14));

@@ -512,6 +512,11 @@ impl World {
                     assert_eq!(request.reset_count, self.vehicle.reset_count);
                     self.shift = DVec3::from_array(request.shift_m);
                 }
+                // A px4-link that was just started knows nothing yet.
+                if self.tick < self.link_back {
+                    self.answer(id, CommandStatus::Refused);
+                    return;
+                }
                 let piloted = self.vehicle.commander == Commander::Pilot.code();
                 if piloted && (command != VehicleCommand::GoOn || self.tick < self.pilot_until) {
                     self.answer(id, CommandStatus::Refused);

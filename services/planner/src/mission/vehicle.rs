@@ -175,6 +175,8 @@ impl Mission {
             return State::Launching;
         } else if Self::under_control(&vehicle) {
             self.flown = true;
+            // What was refused before counts no more: each px4-link that was started anew refuses once.
+            self.refusals = 0;
             // Seen before its answer came: nobody need ask again.
             if let Some(pending) = self.pending.take() {
                 self.out.effects.push(crate::io::Effect::CommandOver(pending.id));
