@@ -15,8 +15,8 @@ use splatting::order::Random;
 
 use crate::common::{system_files, vantage};
 
-/// Each is started and killed by a thread of its own.
-const LANES: [&str; 5] = ["px4-link", "camera", "trainer", "scorer", "planner"];
+/// Each is started and killed by a thread of its own. Not the camera, which waits for the world before it speaks.
+const LANES: [&str; 5] = ["px4-link", "recorder", "trainer", "scorer", "planner"];
 /// A start that takes longer than this hangs: joining takes a fraction of a second, and what another's death left half-made
 /// is removed after 1.5 s at the latest.
 const WEDGED: Duration = Duration::from_secs(20);
