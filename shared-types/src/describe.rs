@@ -27,35 +27,21 @@ pub trait Describe: Sized {
     }
 }
 
-macro_rules! integers {
-    ($($number:ty),*) => { $(
+macro_rules! numbers {
+    ($schema:tt: $($number:ty),*) => { $(
         impl Describe for $number {
             fn json(&self) -> Value {
                 Value::from(*self)
             }
 
             fn schema() -> Value {
-                json!({ "type": "integer" })
+                json!({ "type": $schema })
             }
         }
     )* };
 }
-integers!(u16, u32, u64, i32, i64);
-
-macro_rules! floats {
-    ($($number:ty),*) => { $(
-        impl Describe for $number {
-            fn json(&self) -> Value {
-                Value::from(*self)
-            }
-
-            fn schema() -> Value {
-                json!({ "type": ["number", "null"] })
-            }
-        }
-    )* };
-}
-floats!(f32, f64);
+numbers!("integer": u16, u32, u64, i32, i64);
+numbers!(["number", "null"]: f32, f64);
 
 impl Describe for u8 {
     fn json(&self) -> Value {
