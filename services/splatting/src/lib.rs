@@ -45,7 +45,7 @@ pub mod uncertainty;
 mod view;
 mod workers;
 
-pub use backend::{Backend, BackendError, BackendKind, BackendOptions, Training};
+pub use backend::{Arrival, Backend, BackendError, BackendKind, BackendOptions, Training};
 pub use camera::{Camera, Pose, RenderSettings};
 pub use densify::{
     DefaultSettings, Densifier, DensifierState, DensifyError, DensifyReport, McmcSettings, Relocation, Strategy,

@@ -14,7 +14,7 @@ use splatting::{Gaussians, Optimiser};
 
 use crate::logic::rounds::LossHistory;
 use crate::round::{FinishedRound, RoundSpec};
-use crate::session::{ActiveRound, Progression, Session};
+use crate::session::{ActiveRound, Progression, Session, State};
 use splatting::bytes::{Reader, Truncated, Writer, checksum};
 use splatting::order::ViewOrder;
 use splatting::rgbd::voxels::VoxelGrid;
@@ -53,12 +53,12 @@ pub enum CheckpointError {
 /// Iterations of a mission and ids of Gaussians stay far below this; sums of them do not overflow.
 const MOST: u64 = 1 << 40;
 
-/// A checkpoint taken from disk.
+/// A checkpoint in memory.
 #[derive(Debug)]
 pub struct Checkpoint {
-    model: Gaussians,
-    optimiser: Optimiser,
-    progression: Progression,
+    pub(crate) model: Gaussians,
+    pub(crate) optimiser: Optimiser,
+    pub(crate) progression: Progression,
 }
 
 impl Checkpoint {
@@ -74,6 +74,16 @@ impl Checkpoint {
         self.model.len()
     }
 
+    /// Its bytes.
+    #[must_use]
+    pub fn to_bytes(&self) -> Vec<u8> {
+        encode(self.state())
+    }
+
+    pub(crate) fn state(&self) -> State<'_> {
+        State { progression: &self.progression, model: &self.model, optimiser: &self.optimiser }
+    }
+
     /// Puts the session where the checkpoint was taken. The caller then reads the keyframes
     /// ([`Session::resume`]).
     pub fn restore_into(self, session: &mut Session) {
@@ -84,7 +94,10 @@ impl Checkpoint {
 /// The bytes of a checkpoint of a session, as of its last [`Session::sync`].
 #[must_use]
 pub fn to_bytes(session: &Session) -> Vec<u8> {
-    let progression = &session.progression;
+    encode(session.state())
+}
+
+fn encode(State { progression, model, optimiser }: State<'_>) -> Vec<u8> {
     let mut w = Writer::default();
     w.u64(MAGIC);
     w.u32(VERSION);
@@ -110,7 +123,7 @@ pub fn to_bytes(session: &Session) -> Vec<u8> {
             w.f32(footprint);
         });
     });
-    w.blob(&splatting::checkpoint::encode(session.training.model(), session.training.optimiser()));
+    w.blob(&splatting::checkpoint::encode(model, optimiser));
     let mut bytes = w.into_bytes();
     let sum = checksum(&bytes);
     bytes.extend_from_slice(&sum.to_le_bytes());
@@ -186,15 +199,21 @@ pub fn from_bytes(bytes: &[u8]) -> Result<Checkpoint, CheckpointError> {
     Ok(Checkpoint { model, optimiser, progression })
 }
 
-/// Writes a checkpoint of a session into `folder` (the mission's `model/`), then removes those no longer needed.
+/// Writes a checkpoint of a session, as of its last [`Session::sync`], into `folder` (the mission's `model/`), then removes
+/// those no longer needed.
 ///
 /// # Errors
 /// When it cannot be written; older ones then still stand.
 pub fn write(folder: &Path, session: &Session) -> Result<PathBuf, FolderError> {
-    let (generation, is_final) = session.generation_now().unwrap_or_default();
+    write_state(folder, session.state())
+}
+
+/// The same with a state that is not the session's any more.
+pub(crate) fn write_state(folder: &Path, state: State<'_>) -> Result<PathBuf, FolderError> {
+    let (generation, is_final) = state.progression.generation().unwrap_or_default();
     let kind = if is_final { "final" } else { "live" };
     let path = folder.join(format!("checkpoint-{generation:012}-{kind}.ckpt"));
-    write_atomic(&path, &to_bytes(session))?;
+    write_atomic(&path, &encode(state))?;
     let all = list(folder);
     let newest_final = all.iter().find(|entry| entry.is_final).map(|entry| entry.path.clone());
     for entry in all.iter().skip(KEPT).filter(|entry| Some(&entry.path) != newest_final.as_ref()) {

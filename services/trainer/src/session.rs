@@ -8,8 +8,11 @@ use std::collections::{BTreeMap, VecDeque};
 use shared_types::config::trainer::BirthShape;
 use shared_types::config::{ModelConfig, TrainerConfig};
 use shared_types::messages::GaussianRow;
-use splatting::{Backend, BackendError, Gaussian, Gaussians, Optimiser, Training, TrainingSettings};
+use splatting::{
+    Arrival, Backend, BackendError, Gaussian, Gaussians, LossTerms, Optimiser, Training, TrainingSettings,
+};
 
+use crate::checkpoint::Checkpoint;
 use crate::keyframes::{self, KeyframeError, KeyframeSource, SmallKeyframe, View};
 use crate::logic::rounds::{LossHistory, means_learning_rate, window_views};
 use crate::round::{FinishedRound, Progress, RoundSpec, generation};
@@ -45,6 +48,19 @@ pub(crate) struct ActiveRound {
     pub(crate) psnr_db: VecDeque<f64>,
 }
 
+impl ActiveRound {
+    /// Takes in the loss of an iteration, whose view has foreground or none.
+    fn take_loss(&mut self, terms: &LossTerms, has_foreground: bool) {
+        self.losses.push(terms.total);
+        if has_foreground {
+            if self.psnr_db.len() == PSNR_IMAGES {
+                self.psnr_db.pop_front();
+            }
+            self.psnr_db.push_back(terms.foreground_psnr_db().min(PSNR_MAX_DB));
+        }
+    }
+}
+
 /// What of a session goes into a checkpoint, besides the model and its optimiser.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Progression {
@@ -66,6 +82,45 @@ impl Progression {
             total_iterations: 0,
             finished: Vec::new(),
             active: None,
+        }
+    }
+
+    /// Generation of a snapshot or checkpoint taken now, and whether it is of a round's end; `None` before the first round.
+    pub(crate) fn generation(&self) -> Option<(u64, bool)> {
+        let is_final = self.active.is_none();
+        Some((generation(self.total_iterations, self.last_spec()?.round, is_final), is_final))
+    }
+
+    /// What the round under work was asked, or the last one.
+    fn last_spec(&self) -> Option<&RoundSpec> {
+        let active = self.active.as_ref().map(|round| &round.spec);
+        active.or(self.finished.last().map(|round| &round.spec))
+    }
+}
+
+/// Everything that a checkpoint holds.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct State<'a> {
+    pub(crate) progression: &'a Progression,
+    pub(crate) model: &'a Gaussians,
+    pub(crate) optimiser: &'a Optimiser,
+}
+
+/// A checkpoint that is on its way from the back end.
+#[derive(Debug)]
+struct Awaited {
+    progression: Progression,
+    /// Iterations of it whose losses are not known yet.
+    untold: usize,
+}
+
+impl Awaited {
+    fn take_loss(&mut self, terms: &LossTerms, has_foreground: bool) {
+        if self.untold > 0
+            && let Some(round) = &mut self.progression.active
+        {
+            self.untold -= 1;
+            round.take_loss(terms, has_foreground);
         }
     }
 }
@@ -95,6 +150,7 @@ pub struct Session {
     pub(crate) progression: Progression,
     /// What a snapshot that is on its way will say.
     snapshot_begun: Option<Snapshot>,
+    checkpoint_begun: Option<Awaited>,
     /// Keyframes prepared for training, and the clip box that their masks are for.
     views: BTreeMap<u64, View>,
     views_clip: Option<ClipBox>,
@@ -120,6 +176,7 @@ impl Session {
             have_foreground: VecDeque::new(),
             progression: Progression::new(),
             snapshot_begun: None,
+            checkpoint_begun: None,
             views: BTreeMap::new(),
             views_clip: None,
         }
@@ -281,20 +338,13 @@ impl Session {
         let Some(spec) = self.active().cloned() else { return Ok(None) };
         self.prune(&spec)?;
         self.sync()?;
+        self.checkpoint_begun = None;
         let progress = self.progress();
         self.progression.active = None;
         let generation = generation(progress.total_iterations, spec.round, true);
         let finished = FinishedRound { generation, progress, spec };
         self.progression.finished.push(finished.clone());
         Ok(Some(finished))
-    }
-
-    /// Generation of a snapshot or checkpoint taken now, and whether it is of a round's end; `None` before the first round.
-    #[must_use]
-    pub fn generation_now(&self) -> Option<(u64, bool)> {
-        let is_final = self.active().is_none();
-        let round = self.active().or(self.finished().last().map(|round| &round.spec))?.round;
-        Some((generation(self.progression.total_iterations, round, is_final), is_final))
     }
 
     /// The model as it is published: live during a round, final between rounds; `None` before the first. Of the last
@@ -327,14 +377,62 @@ impl Session {
 
     /// A snapshot without its rows.
     fn untaken_snapshot(&self) -> Option<Snapshot> {
-        let (generation, is_final) = self.generation_now()?;
+        let (generation, is_final) = self.progression.generation()?;
         Some(Snapshot {
             generation,
             total_iterations: self.progression.total_iterations,
             is_final,
             rows: Vec::new(),
-            spec: self.active().or(self.finished().last().map(|round| &round.spec))?.clone(),
+            spec: self.progression.last_spec()?.clone(),
         })
+    }
+
+    /// What a checkpoint holds, of the last [`Session::sync`].
+    pub(crate) fn state(&self) -> State<'_> {
+        let (model, optimiser) = (self.training.model(), self.training.optimiser());
+        State { progression: &self.progression, model, optimiser }
+    }
+
+    /// Begins to bring here what a checkpoint holds, as it is now, which training does not wait for; `false` where it is
+    /// here, as it always is on the CPU. One that is on its way already is left alone.
+    ///
+    /// # Errors
+    /// When the back end failed.
+    pub fn begin_checkpoint(&mut self) -> Result<bool, BackendError> {
+        if self.checkpoint_begun.is_some() {
+            return Ok(true);
+        }
+        let begun = self.training.begin_state_copy()?;
+        self.checkpoint_begun = begun.then(|| self.awaited());
+        Ok(begun)
+    }
+
+    /// Everything that is known here of a state that is on its way.
+    fn awaited(&self) -> Awaited {
+        Awaited { progression: self.progression.clone(), untold: self.have_foreground.len() }
+    }
+
+    /// The checkpoint that was begun, once it is here: of the iterations done when it was begun, or of some more where the
+    /// back end had to do them again. The end of a round forgets it.
+    ///
+    /// # Errors
+    /// When the back end failed.
+    pub fn take_checkpoint(&mut self) -> Result<Option<Checkpoint>, BackendError> {
+        if self.checkpoint_begun.is_none() {
+            return Ok(None);
+        }
+        match self.training.take_state_copy()? {
+            Arrival::Here((model, optimiser)) => {
+                self.take_losses()?;
+                let awaited = self.checkpoint_begun.take();
+                Ok(awaited.map(|Awaited { progression, .. }| Checkpoint { model, optimiser, progression }))
+            }
+            Arrival::NotYet => Ok(None),
+            Arrival::Anew => {
+                self.checkpoint_begun = Some(self.awaited());
+                Ok(None)
+            }
+        }
     }
 
     fn is_over(&self) -> bool {
@@ -370,12 +468,10 @@ impl Session {
         let finished = self.training.finished()?;
         let Some(round) = &mut self.progression.active else { return Ok(()) };
         for terms in finished {
-            round.losses.push(terms.total);
-            if self.have_foreground.pop_front() == Some(true) {
-                if round.psnr_db.len() == PSNR_IMAGES {
-                    round.psnr_db.pop_front();
-                }
-                round.psnr_db.push_back(terms.foreground_psnr_db().min(PSNR_MAX_DB));
+            let has_foreground = self.have_foreground.pop_front() == Some(true);
+            round.take_loss(&terms, has_foreground);
+            if let Some(awaited) = &mut self.checkpoint_begun {
+                awaited.take_loss(&terms, has_foreground);
             }
         }
         Ok(())
@@ -490,6 +586,7 @@ impl Session {
         self.training.restore(model, optimiser);
         self.have_foreground.clear();
         self.snapshot_begun = None;
+        self.checkpoint_begun = None;
         self.progression = progression;
     }
 }

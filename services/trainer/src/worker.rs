@@ -12,6 +12,7 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use shared_types::folder::{FolderError, write_atomic};
+use shared_types::stage;
 
 use splatting::BackendError;
 
@@ -19,7 +20,7 @@ use crate::backend;
 use crate::checkpoint;
 use crate::keyframes::KeyframeSource;
 use crate::round::{FinishedRound, Progress, RoundSpec};
-use crate::session::{Session, SessionError, Snapshot};
+use crate::session::{Session, SessionError, Snapshot, State};
 
 /// Results that may wait to be published: bounds how far the thread runs ahead of the mission clock, and its memory.
 const AHEAD: usize = 8;
@@ -310,6 +311,8 @@ impl Thread {
         let done_before = self.session.active().is_none()
             && self.session.finished().last().is_some_and(|finished| finished.spec == spec);
         if !done_before {
+            let keyframes = spec.keyframes.len();
+            let stage = stage!("insert", round, keyframes);
             match self.begin(spec) {
                 Ok(()) => {}
                 Err(SessionError::Backend(error)) => return Err(error.into()),
@@ -318,13 +321,18 @@ impl Thread {
                 }
             }
             self.signals.work.fetch_add(1, Ordering::Relaxed);
+            drop(stage);
+            let stage = stage!("train", round, keyframes, gaussians = self.session.model().len());
             if !self.train()? {
                 return Err(End::Unwanted);
             }
+            drop(stage);
+            let _stage = stage!("finish", round);
             backend::record_memory(&self.model_folder, self.session.backend());
             self.session.finish()?;
         }
         // On disk before anybody hears of it.
+        let _stage = stage!("write the round", round);
         if let Err(error) = self.keep_round(round)? {
             return self.send(Output::Failed { round, reason: error.to_string() });
         }
@@ -367,11 +375,15 @@ impl Thread {
                 work.fetch_add(1, Ordering::Relaxed);
             })?;
             let progress = self.session.progress();
-            if !over && self.is_due(before, progress.iterations, false) {
-                self.checkpoint()?;
+            if !over && self.is_due(before, progress.iterations, false) && !self.session.begin_checkpoint()? {
+                self.write_checkpoint(self.session.state());
+            }
+            if let Some(checkpoint) = self.session.take_checkpoint()? {
+                self.write_checkpoint(checkpoint.state());
             }
             if self.signals.stop.load(Ordering::Relaxed) {
-                self.checkpoint()?;
+                self.session.sync()?;
+                self.write_checkpoint(self.session.state());
                 return Ok(false);
             }
             if progress.iterations == before {
@@ -439,9 +451,10 @@ impl Thread {
         }
     }
 
-    fn checkpoint(&mut self) -> Result<(), End> {
-        self.synced()?;
-        match checkpoint::write(&self.model_folder, &self.session) {
+    /// Writes a checkpoint within a round; training goes on without it.
+    fn write_checkpoint(&self, state: State<'_>) {
+        let _stage = stage!("write a checkpoint");
+        match checkpoint::write_state(&self.model_folder, state) {
             Ok(_path) => self.signals.tell(String::new()),
             Err(error) => {
                 let skipped = self.signals.skipped.fetch_add(1, Ordering::Relaxed) + 1;
@@ -449,12 +462,6 @@ impl Thread {
                 self.signals.tell(error.to_string());
             }
         }
-        Ok(())
-    }
-
-    fn synced(&mut self) -> Result<&Session, BackendError> {
-        self.session.sync()?;
-        Ok(&self.session)
     }
 }
 

@@ -13,6 +13,7 @@ use crate::gpu::{self, GpuError};
 use crate::model::Gaussians;
 use crate::uncertainty::{Uncertainty, UncertaintySettings, uncertainty};
 
+pub use crate::gpu::Arrival;
 pub use training::Training;
 
 /// What is asked for.

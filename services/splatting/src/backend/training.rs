@@ -3,7 +3,7 @@
 use super::{Backend, BackendError};
 use crate::densify::Noise;
 use crate::edit::{Draft, Edit, Looks};
-use crate::gpu::{self, GpuError};
+use crate::gpu::{self, Arrival, Copied, GpuError};
 use crate::model::Gaussians;
 use crate::optimiser::Optimiser;
 use crate::rgbd::prune::{self, DepthView, PruneRules};
@@ -45,6 +45,8 @@ pub struct Training {
     statistics: ScreenStatistics,
     newest: Newest,
     copy: Copy,
+    /// Whether a copy of model and optimiser is on its way.
+    state_copied: bool,
     finished: Vec<LossTerms>,
 }
 
@@ -58,6 +60,7 @@ impl Training {
             statistics: ScreenStatistics::new(),
             newest: Newest::Host,
             copy: Copy::None,
+            state_copied: false,
             finished: Vec::new(),
         }
     }
@@ -221,7 +224,7 @@ impl Training {
     pub fn begin_copy(&mut self) -> Result<(), BackendError> {
         self.copy = match (&mut self.backend, self.newest) {
             (Backend::Gpu(engine), Newest::Gpu) => {
-                engine.begin_copy()?;
+                engine.begin_copy(Copied::Model)?;
                 Copy::OnItsWay
             }
             _ => Copy::Here(Box::new(self.gaussians.clone())),
@@ -237,21 +240,51 @@ impl Training {
         match (std::mem::take(&mut self.copy), &mut self.backend) {
             (Copy::Here(gaussians), _) => Ok(Some(*gaussians)),
             (Copy::OnItsWay, Backend::Gpu(engine)) => {
-                let mut gaussians = self.gaussians.clone();
-                if engine.take_copy(&mut gaussians, wait)? {
-                    return Ok(Some(gaussians));
+                let copy = engine.take_copy(&self.gaussians, wait)?;
+                if copy.is_none() {
+                    self.copy = Copy::OnItsWay;
                 }
-                self.copy = Copy::OnItsWay;
-                Ok(None)
+                Ok(copy)
             }
             _ => Ok(None),
         }
     }
 
+    /// Begins to copy model and optimiser as the steps asked for so far leave them, while training goes on; `false` where
+    /// there is nothing to copy, as their newest state is here. What changes the list of Gaussians forgets the copy.
+    ///
+    /// # Errors
+    /// Where the GPU fails.
+    pub fn begin_state_copy(&mut self) -> Result<bool, BackendError> {
+        if let (Backend::Gpu(engine), Newest::Gpu) = (&mut self.backend, self.newest) {
+            engine.begin_copy(Copied::State)?;
+            self.state_copied = true;
+        } else {
+            self.state_copied = false;
+        }
+        Ok(self.state_copied)
+    }
+
+    /// The copy of model and optimiser that was begun, once it is here. By then [`Training::finished`] tells every loss up to
+    /// it. Does not wait.
+    ///
+    /// # Errors
+    /// Where the GPU fails.
+    pub fn take_state_copy(&mut self) -> Result<Arrival<(Gaussians, Optimiser)>, BackendError> {
+        let Backend::Gpu(engine) = &mut self.backend else { return Ok(Arrival::NotYet) };
+        if !self.state_copied {
+            return Ok(Arrival::NotYet);
+        }
+        let arrival = engine.take_state(&self.gaussians)?;
+        self.state_copied = !matches!(arrival, Arrival::Here(_));
+        Ok(arrival)
+    }
+
     fn forget_copy(&mut self) {
         self.copy = Copy::None;
+        self.state_copied = false;
         if let Backend::Gpu(engine) = &mut self.backend {
-            engine.forget_copy();
+            engine.forget_copies();
         }
     }
 

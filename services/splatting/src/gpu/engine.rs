@@ -1,13 +1,13 @@
 //! The GPU engine: what the CPU engine does, on an adapter.
 
 use bytemuck::pod_collect_to_vec;
-use wgpu::{Buffer, Features};
+use wgpu::Features;
 
 use super::adapter;
 use super::buffers::Bytes;
 use super::chain::{Size, dispatch};
 use super::context::Context;
-use super::copying::Copying;
+use super::copying::Copies;
 use super::drawing::{Drawing, overflow};
 use super::error::GpuError;
 use super::job::View;
@@ -58,9 +58,7 @@ pub struct Engine {
     pub(super) depths: Depths,
     /// Terms of iterations whose trainer is gone.
     pub(super) told: Vec<LossTerms>,
-    pub(super) copying: Option<Copying>,
-    /// Where the last copy came through.
-    pub(super) copy_staging: Option<Buffer>,
+    pub(super) copies: Copies,
     /// How often iterations were taken back because lists did not fit.
     pub(super) taken_back: u64,
     /// Pairs per view that were needed so far, with something to spare.
@@ -88,8 +86,7 @@ impl Engine {
             keyframes: Keyframes::new(options.keyframe_bytes),
             depths: Depths::default(),
             told: Vec::new(),
-            copying: None,
-            copy_staging: None,
+            copies: Copies::default(),
             taken_back: 0,
             pairs: options.pairs,
         })
@@ -118,8 +115,8 @@ impl Engine {
         }
         all.push(("keyframes", self.keyframes.bytes()));
         all.push(("depth images", self.depths.bytes()));
-        let staging = self.copying.iter().map(Copying::bytes).chain(self.copy_staging.iter().map(Buffer::size));
-        all.push(("snapshots", staging.sum()));
+        all.push(("snapshots", self.copies.model.bytes()));
+        all.push(("checkpoints", self.copies.state.bytes()));
         all
     }
 
@@ -207,7 +204,7 @@ impl Engine {
     ) -> Result<(), GpuError> {
         optimiser.fit(gaussians);
         statistics.fit(gaussians);
-        self.forget_copy();
+        self.forget_copies();
         self.told.clear();
         self.trainer = None;
         self.model = None;

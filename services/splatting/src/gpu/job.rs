@@ -90,9 +90,9 @@ pub(super) struct Job {
 pub(super) const JOB_BYTES: u64 = size_of::<Job>() as u64;
 /// Distance of jobs and of views in their rings: what every adapter accepts as an offset.
 pub(super) const STRIDE: u64 = 256;
-/// Views of a chain.
-pub(super) const VIEWS_MAX: u32 = 64;
-/// Words of the control buffer before the sums of the parameter pass.
+/// Views of a chain: all candidates of a round.
+pub(super) const VIEWS_MAX: u32 = 128;
+/// Words of the control buffer before the sums of the parameter pass: `CONTROL_SUMS` of `job.wgsl`.
 pub(super) const CONTROL_WORDS: u64 = 4 + VIEWS_MAX as u64;
 /// Whether the chain has stopped, and the most pairs that a view had.
 pub(super) const CONTROL_HALT: usize = 0;
@@ -131,5 +131,6 @@ mod unit_tests {
     fn jobs_and_views_fit_their_strides() {
         assert_eq!((JOB_BYTES, VIEW_BYTES), (160, 128));
         const { assert!(JOB_BYTES <= STRIDE && VIEW_BYTES <= STRIDE) };
+        assert!(include_str!("shaders/job.wgsl").contains(&format!("CONTROL_SUMS: u32 = {CONTROL_WORDS}u;")));
     }
 }

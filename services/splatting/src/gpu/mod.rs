@@ -32,5 +32,6 @@ mod training;
 
 pub use adapter::{AdapterReport, adapters, may_exist};
 pub use check::{CheckReport, check};
+pub use copying::{Arrival, Copied};
 pub use engine::{Engine, Options};
 pub use error::GpuError;

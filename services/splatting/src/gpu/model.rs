@@ -104,6 +104,19 @@ impl DeviceModel {
         rest.copy_from_slice(&bands[..rest.len()]);
     }
 
+    /// Puts bytes of the three buffers into the optimiser.
+    pub fn fill_optimiser(&self, optimiser: &mut Optimiser, state: &[u8], band_state: &[u8], steps: &[u8]) {
+        let state_half = (BLOCK_BYTES * self.blocks()) as usize;
+        let bands_half = (LANES_BYTES * self.blocks()) as usize * sh_rest_rows(self.sh_degree);
+        // Buffers are never empty, so they may be longer than what they hold.
+        let (first, second) = state[..2 * state_half].split_at(state_half);
+        (optimiser.first, optimiser.second) = (pod_collect_to_vec(first), pod_collect_to_vec(second));
+        let (first, second) = band_state[..2 * bands_half].split_at(bands_half);
+        (optimiser.first_rest, optimiser.second_rest) = (pod_collect_to_vec(first), pod_collect_to_vec(second));
+        optimiser.sh_degree = self.sh_degree;
+        optimiser.steps = pod_collect_to_vec(&steps[..4 * self.gaussians as usize]);
+    }
+
     /// Copies back what decisions about the list are made of.
     pub fn look(
         &self,
@@ -150,12 +163,7 @@ impl DeviceModel {
             (&device.statistics, STATISTICS_BYTES * blocks as u64),
         ])?;
         self.fill(model, &parameters, &bands);
-        let (first, second) = state.split_at(block_bytes as usize);
-        (optimiser.first, optimiser.second) = (pod_collect_to_vec(first), pod_collect_to_vec(second));
-        let (first, second) = band_state.split_at(row_bytes as usize);
-        (optimiser.first_rest, optimiser.second_rest) = (pod_collect_to_vec(first), pod_collect_to_vec(second));
-        optimiser.sh_degree = self.sh_degree;
-        optimiser.steps = pod_collect_to_vec(&steps);
+        self.fill_optimiser(optimiser, &state, &band_state, &steps);
         statistics.fit(model);
         cast_slice_mut::<Lanes, u8>(statistics.rows_mut()).copy_from_slice(&seen);
         Ok(())

@@ -198,6 +198,47 @@ fn a_second_round_on_a_gpu_is_the_one_of_a_checkpoint() {
     assert!(ends[0] == ends[1]);
 }
 
+/// A checkpoint within a round is that of the moment it was begun, though training went on before it arrived.
+#[test]
+fn a_checkpoint_that_a_gpu_brings_later_is_of_the_moment_it_was_begun() {
+    let test = "a_checkpoint_that_a_gpu_brings_later_is_of_the_moment_it_was_begun";
+    let Some(adapter) = splatting::gpu::adapters().into_iter().next() else {
+        assert!(std::env::var_os("VANTAGE_EXPECT_GPU").is_none(), "no GPU adapter, but one was expected");
+        println!("{test}: skipped, no GPU adapter");
+        return;
+    };
+    let options =
+        BackendOptions { kind: BackendKind::Gpu, adapter: Some(adapter.name), threads: 1, deterministic: true };
+    let model = shared_types::config::ModelConfig { width: 48, height: 36, ..model_config() };
+    let mut source = Memory::new((48, 36));
+    let begun = |source: &mut Memory| {
+        let mut session = Session::new(TrainerConfig::default(), model.clone(), Backend::new(&options).unwrap().0);
+        session.begin(spec(0, 50_000, &[0, 2, 4]), source).unwrap();
+        assert!(!session.begin_checkpoint().unwrap(), "nothing is newer on the GPU yet");
+        session.advance(37, || ()).unwrap();
+        session
+    };
+    let mut waited_for = begun(&mut source);
+    waited_for.sync().unwrap();
+    assert!(!waited_for.begin_checkpoint().unwrap(), "it is here");
+    let expected = checkpoint::to_bytes(&waited_for);
+
+    let mut session = begun(&mut source);
+    assert!(session.begin_checkpoint().unwrap());
+    let (found, after) = (38..)
+        .find_map(|iterations| {
+            assert!(!session.advance(1, || ()).unwrap(), "it never arrived");
+            session.take_checkpoint().unwrap().map(|found| (found, iterations))
+        })
+        .unwrap();
+    assert!(found.to_bytes() == expected, "taken after {after} iterations");
+    assert!(session.take_checkpoint().unwrap().is_none(), "it is taken once");
+    // One that has not arrived by the round's end is not wanted any more.
+    assert!(session.begin_checkpoint().unwrap());
+    session.finish().unwrap();
+    assert!(session.take_checkpoint().unwrap().is_none());
+}
+
 #[test]
 fn the_newest_whole_checkpoint_wins() {
     let folder = tempfile::tempdir().unwrap();

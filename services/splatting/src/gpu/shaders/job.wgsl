@@ -85,7 +85,7 @@ const MOMENTS: u32 = 12u;
 const CONTROL_HALT: u32 = 0u;
 const CONTROL_PAIRS: u32 = 1u;
 const CONTROL_VISIBLE: u32 = 4u;
-const CONTROL_SUMS: u32 = 68u;
+const CONTROL_SUMS: u32 = 132u;
 
 /// Whether a number is finite and its magnitude below a limit. By its bits: a compiler may assume that no number is NaN.
 fn below(value: f32, limit: f32) -> bool {

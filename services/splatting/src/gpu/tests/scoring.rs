@@ -45,8 +45,8 @@ fn views_are_scored_as_on_the_cpu() {
     // Lists that do not fit at first, so that a batch is drawn again.
     let mut gpu = Backend::Gpu(Box::new(Engine::new(&Options { pairs: 60, ..options }).unwrap()));
     let mut cpu = Backend::from(crate::Engine::new(1).unwrap());
-    // More of one size than a chain has, once: 69 of the 97.
-    for (mode, count) in [(VarianceMode::Normalised, 97), (VarianceMode::Paper, 23)] {
+    // More of one size than a chain has, once: 135 of the 189.
+    for (mode, count) in [(VarianceMode::Normalised, 189), (VarianceMode::Paper, 23)] {
         let cameras = cameras(count);
         for model in [scene(400, 8), scene(17, 9), Gaussians::new()] {
             let expected = of(&mut cpu, &model, &cameras, mode);

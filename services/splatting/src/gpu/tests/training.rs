@@ -2,7 +2,7 @@
 
 use glam::Vec3;
 
-use super::super::{Engine, Options};
+use super::super::{Arrival, Copied, Engine, Options};
 use super::{options, skipped, with_engine};
 use crate::tests::harmonics::scene_of_degree;
 use crate::tests::{camera, random_view, scene};
@@ -227,7 +227,7 @@ fn half_a_million_gaussians_and_48_keyframes_fit_420_mb() {
     let model = scene(500_000, 1);
     engine.upload(&model, &mut Optimiser::new(), &mut ScreenStatistics::new()).unwrap();
     // With a snapshot on its way. The step is asked for and never run: what counts is what is allocated.
-    engine.begin_copy().unwrap();
+    engine.begin_copy(Copied::Model).unwrap();
     engine.step(&random_view(camera(320, 240), 1), &settings()).unwrap();
     let mut all = 0;
     for (what, bytes) in engine.bytes() {
@@ -276,27 +276,89 @@ fn a_copy_is_of_the_moment_it_was_begun() {
     let (expected, ..) = on_gpu(&mut engine(0), &start, &views, 21);
     let mut gpu = engine(0);
     gpu.upload(&start, &mut Optimiser::new(), &mut ScreenStatistics::new()).unwrap();
-    let mut copy = start.clone();
-    assert!(!gpu.take_copy(&mut copy, true).unwrap(), "none was begun");
+    assert!(gpu.take_copy(&start, true).unwrap().is_none(), "none was begun");
     for i in 0..60 {
         gpu.step(&views[i % views.len()], &settings()).unwrap();
-        if i == 5 {
-            // Forgotten for the next.
-            gpu.begin_copy().unwrap();
-        }
-        if i == 20 {
-            gpu.begin_copy().unwrap();
+        if i == 5 || i == 20 {
+            // The first is forgotten for the second.
+            gpu.begin_copy(Copied::Model).unwrap();
         }
     }
-    assert!(copy == start && gpu.take_copy(&mut copy, true).unwrap());
-    assert!(copy == expected, "of 21 iterations");
-    assert!(!gpu.take_copy(&mut copy, false).unwrap(), "it is taken once");
+    assert!(gpu.take_copy(&start, true).unwrap() == Some(expected.clone()), "of 21 iterations");
+    assert!(gpu.take_copy(&start, false).unwrap().is_none(), "it is taken once");
     // Lists that do not fit: what was copied was not trained, so it is copied again.
     let mut small = engine(40);
     small.upload(&start, &mut Optimiser::new(), &mut ScreenStatistics::new()).unwrap();
     for i in 0..21 {
         small.step(&views[i % views.len()], &settings()).unwrap();
     }
-    small.begin_copy().unwrap();
-    assert!(small.take_copy(&mut copy, true).unwrap() && copy == expected);
+    small.begin_copy(Copied::Model).unwrap();
+    assert!(small.take_copy(&start, true).unwrap() == Some(expected));
+}
+
+/// A checkpoint comes while training goes on: model and optimiser of one moment, with every loss up to it told.
+#[test]
+fn a_copy_of_everything_is_what_a_download_at_that_moment_is() {
+    let test = "a_copy_of_everything_is_what_a_download_at_that_moment_is";
+    let Some(options) = options() else { return skipped(test) };
+    for degree in [0, 2] {
+        let (start, views) = task(200, (48, 40), degree);
+        let settings = TrainingSettings {
+            render: RenderSettings { sh_degree: degree, ..RenderSettings::default() },
+            ..settings()
+        };
+        let engine = |pairs| Engine::new(&Options { deterministic: true, pairs, ..options.clone() }).unwrap();
+        let ready = |pairs| {
+            let mut engine = engine(pairs);
+            engine.upload(&start, &mut Optimiser::new(), &mut ScreenStatistics::new()).unwrap();
+            engine
+        };
+        let at = |iterations: usize| {
+            let mut engine = ready(0);
+            (0..iterations).for_each(|i| engine.step(&views[i % views.len()], &settings).unwrap());
+            let (mut model, mut optimiser) = (start.clone(), Optimiser::new());
+            engine.download(&mut model, &mut optimiser, &mut ScreenStatistics::new()).unwrap();
+            (model, optimiser)
+        };
+        let mut gpu = ready(0);
+        assert!(gpu.take_state(&start).unwrap() == Arrival::NotYet, "none was begun");
+        let mut told = 0;
+        let (found, steps) = (0..)
+            .find_map(|i: usize| {
+                assert!(i < 100_000, "a copy never arrived");
+                gpu.step(&views[i % views.len()], &settings).unwrap();
+                if i == 20 {
+                    gpu.begin_copy(Copied::State).unwrap();
+                }
+                told += gpu.finished().unwrap().len();
+                match gpu.take_state(&start).unwrap() {
+                    Arrival::Here(found) => Some((found, i + 1)),
+                    Arrival::NotYet => None,
+                    Arrival::Anew => panic!("all lists fit"),
+                }
+            })
+            .unwrap();
+        told += gpu.finished().unwrap().len();
+        assert!(told >= 21 && told <= steps, "{told} losses of {steps} steps");
+        assert!(found == at(21), "degree {degree}");
+        // Lists that do not fit: it is copied anew, and says so.
+        let mut small = ready(40);
+        (0..21).for_each(|i| small.step(&views[i % views.len()], &settings).unwrap());
+        small.begin_copy(Copied::State).unwrap();
+        (21..25).for_each(|i| small.step(&views[i % views.len()], &settings).unwrap());
+        let mut anew = 0;
+        let found = loop {
+            small.finish().unwrap();
+            match small.take_state(&start).unwrap() {
+                Arrival::Here(found) => break found,
+                Arrival::NotYet => std::thread::yield_now(),
+                Arrival::Anew => anew += 1,
+            }
+        };
+        assert!(anew > 0 && found == at(25), "degree {degree}");
+        // Forgotten when the model is replaced.
+        small.begin_copy(Copied::State).unwrap();
+        small.upload(&start, &mut Optimiser::new(), &mut ScreenStatistics::new()).unwrap();
+        assert!(small.take_state(&start).unwrap() == Arrival::NotYet);
+    }
 }
