@@ -24,10 +24,12 @@ pub mod logging;
 pub mod memory;
 pub mod messages;
 pub mod payload;
+pub mod post_mortem;
 pub mod realtime;
 pub mod service;
 pub mod storage;
 pub mod system;
+pub mod trace;
 
 pub use payload::Payload;
 pub use service::ServiceName;
@@ -54,12 +56,13 @@ pub fn s_from_ns(ns: u64) -> f64 {
     s
 }
 
-/// What the [`payload!`] macro needs from its callers' point of view. Not for use by hand.
+/// What the macros [`payload!`] and [`stage!`] need from its callers' point of view. Not for use by hand.
 #[doc(hidden)]
 pub mod private {
     pub use bytemuck::{Pod, Zeroable};
     pub use iceoryx2::prelude::ZeroCopySend;
     pub use serde_json::{Map, Value};
+    pub use tracing;
 
     pub use crate::describe::{object_schema, tell, tell_schema};
     pub use crate::payload::{SCHEMA_SEED, fold, fold_text};

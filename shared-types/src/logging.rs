@@ -5,9 +5,13 @@ use std::os::fd::AsFd as _;
 
 use iceoryx2_log::{Log, LogLevel};
 pub use tracing_subscriber::filter::LevelFilter;
+use tracing_subscriber::filter::{FilterExt as _, filter_fn};
 use tracing_subscriber::layer::SubscriberExt as _;
 use tracing_subscriber::util::SubscriberInitExt as _;
 use tracing_subscriber::{EnvFilter, Layer as _};
+
+use crate::post_mortem::lines::LastLines;
+use crate::trace::{self, Stages};
 
 /// Sends iceoryx2's messages to `tracing`. Its informational chatter is below our debug level.
 struct Bridge;
@@ -40,7 +44,11 @@ pub fn init(default: LevelFilter) {
         Some(journal) => journal.with_field_prefix(Some("VANTAGE".to_owned())).boxed(),
         None => lines.boxed(),
     };
-    if tracing_subscriber::registry().with(filter).with(output).try_init().is_ok() {
+    let kept = LastLines.with_filter(LevelFilter::INFO);
+    let stages = Stages.with_filter(filter_fn(|metadata| metadata.target() == trace::TARGET));
+    // Stages are no part of the log, whatever its level.
+    let output = output.with_filter(filter.and(filter_fn(|metadata| metadata.target() != trace::TARGET)));
+    if tracing_subscriber::registry().with(output).with(kept).with(stages).try_init().is_ok() {
         let reload: Reload =
             Box::new(move |level| handle.reload(EnvFilter::default().add_directive(level.into())).is_ok());
         // A second initialisation cannot get here: try_init succeeds once.

@@ -17,7 +17,8 @@ use shared_types::folder::{Keyframe, MissionFolder};
 use shared_types::messages::{CaptureRequest, KeyframeReason, RenderPurpose, ServiceState, TargetStatus, VehicleState};
 use shared_types::payload::unpack_text;
 use shared_types::service::{Context, HealthReport, Service, ServiceError, Step, StopAnswer};
-use shared_types::{NS_PER_S, TICK_NS};
+use shared_types::trace::Stage;
+use shared_types::{NS_PER_S, TICK_NS, stage};
 
 use crate::logic::gate::{Limits, Shot, Stillness};
 use crate::logic::image::{keyframe, stream_header};
@@ -36,13 +37,14 @@ const STALE_NS: u64 = NS_PER_S / 2;
 const MAX_INSTANTS: usize = 64;
 
 /// An image that was asked for.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug)]
 struct InFlight {
     id: u64,
     stamp_ns: u64,
     motion: CameraMotion,
     since: Instant,
     told: bool,
+    _stage: Stage,
 }
 
 impl InFlight {
@@ -502,5 +504,10 @@ impl Core {
 }
 
 fn in_flight(request: &ImageRequest, motion: CameraMotion) -> InFlight {
-    InFlight { id: request.id, stamp_ns: request.stamp_ns, motion, since: Instant::now(), told: false }
+    let _stage = match request.purpose {
+        RenderPurpose::Capture => stage!("image of a keyframe", track = "keyframes"),
+        RenderPurpose::Depth => stage!("depth image", track = "depth"),
+        RenderPurpose::Stream => stage!("image of the stream", track = "stream"),
+    };
+    InFlight { id: request.id, stamp_ns: request.stamp_ns, motion, since: Instant::now(), told: false, _stage }
 }

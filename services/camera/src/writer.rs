@@ -4,6 +4,7 @@ use std::sync::mpsc::{Receiver, SyncSender, TryRecvError, TrySendError, sync_cha
 use std::thread::JoinHandle;
 
 use shared_types::folder::{FolderError, Keyframe, MissionFolder};
+use shared_types::stage;
 
 /// What became of a keyframe.
 pub type Written = (Keyframe, Result<(), FolderError>);
@@ -26,7 +27,9 @@ impl Writer {
         let (finished, results) = sync_channel(1);
         let thread = std::thread::Builder::new().name("keyframe-writer".to_owned()).spawn(move || {
             while let Ok((folder, keyframe)) = taken.recv() {
+                let stage = stage!("write keyframe");
                 let result = folder.write_keyframe(&keyframe).map(|_| ());
+                drop(stage);
                 if finished.send((keyframe, result)).is_err() {
                     return;
                 }

@@ -171,6 +171,9 @@ pub struct Fly {
     /// Name of the system; default: a fresh one.
     #[arg(long, value_name = "NAME")]
     pub system: Option<String>,
+    /// Measure what every process did when: report/timeline.svg, and report/trace.json for Perfetto (launch.trace).
+    #[arg(long)]
+    pub trace: bool,
     /// Print the result as JSON (report/metrics.json) instead of a table.
     #[arg(long)]
     pub json: bool,

@@ -9,6 +9,7 @@ use shared_types::config::{Config, Layer, LinkConfig, load, load_mission};
 use shared_types::folder::{MissionFolder, write_atomic};
 use shared_types::messages::EndReason;
 use shared_types::system::{Hold, System};
+use shared_types::{ServiceName, stage, trace};
 use world::SceneConfig;
 use world::mesh::{Mesh, Placement};
 
@@ -20,7 +21,7 @@ use crate::machine_check::check_machine;
 use crate::progress::Progress;
 use crate::supervise::children::Starter;
 use crate::supervise::{self, Flight, Outcome};
-use crate::{evaluate, print, say, settings, summary};
+use crate::{evaluate, print, say, settings, summary, timeline};
 
 /// Flies a new mission.
 ///
@@ -111,6 +112,7 @@ fn configure(arguments: &Fly) -> anyhow::Result<Config> {
         });
     }
     let mut config = load(&layers)?;
+    config.launch.trace |= arguments.trace;
     check(&config)?;
     config.mission.preset.clone_from(&arguments.settings.preset);
     config.mission.version = env!("CARGO_PKG_VERSION").to_owned();
@@ -272,6 +274,10 @@ fn mission(
     json: bool,
     claim: Option<Claim>,
 ) -> anyhow::Result<Exit> {
+    if config.launch.trace {
+        trace::begin(&folder.trace_path(), ServiceName::Launch.name())
+            .with_context(|| format!("launch.trace: {}", folder.trace_path().display()))?;
+    }
     let lock = File::open(folder.root())?;
     if flock(&lock, FlockOperation::NonBlockingLockExclusive).is_err() {
         return Err(Refusal::missing(format!(
@@ -293,7 +299,9 @@ fn mission(
             log_level: config.launch.log_level.clone(),
         };
         progress.say(&format!("mission {} in {}", config.mission.id, folder.root().display()));
+        let stage = stage!("fly");
         let mut flight = supervise::run(system, config, starter, &mut progress)?;
+        drop(stage);
         if config.mission.epoch_ns > 0 {
             // What the wall's clock cut off does not repeat.
             flight.deterministic = Some(false);
@@ -317,8 +325,15 @@ fn finish(
         say(&format!("vantage: the figures of this run are not kept: {error:#}"));
     }
     progress.doing("measuring the model against held-out views");
+    let stage = stage!("evaluate");
     let metrics = evaluate::measure(folder, config, evaluate::Effort::of(config), None);
+    drop(stage);
     progress.clear();
+    if config.launch.trace
+        && let Err(error) = timeline::write(folder)
+    {
+        say(&format!("vantage: the trace is not kept: {error:#}"));
+    }
     match metrics {
         Ok(metrics) => {
             if let Err(error) = evaluate::write_metrics(folder, &metrics) {

@@ -34,6 +34,7 @@ pub mod status;
 pub mod summary;
 pub mod supervise;
 pub mod tap;
+pub mod timeline;
 
 use std::process::ExitCode;
 

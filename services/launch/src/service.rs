@@ -10,8 +10,10 @@ use shared_types::channel::HealthChannel;
 use shared_types::config::{Config, Layer, load};
 use shared_types::folder::write_atomic;
 use shared_types::messages::ServiceState;
+use shared_types::post_mortem::{self, About};
 use shared_types::service::Context;
 use shared_types::system::{Hold, System, SystemError};
+use shared_types::trace;
 
 use crate::cli::Service;
 use crate::exit::Refusal;
@@ -47,9 +49,7 @@ pub fn run(name: ServiceName, arguments: &Service) -> anyhow::Result<()> {
             env!("CARGO_PKG_VERSION")
         )));
     }
-    if config.launch.hold_on_fault {
-        hold_panics();
-    }
+    leave_traces(name, &config, &system)?;
     // Before the bus: joining it may wait for what only the keeper removes.
     let sweeping = if name == ServiceName::Keeper { Some(keeper::sweep(&system)?) } else { None };
     let context = Context::open(name, config, system, arguments.supervised)?;
@@ -61,6 +61,35 @@ pub fn run(name: ServiceName, arguments: &Service) -> anyhow::Result<()> {
         clean_up(&system);
     }
     result
+}
+
+/// Sees to what a panic leaves: a report beside the logs, and on request the process itself or its core.
+fn leave_traces(name: ServiceName, config: &Config, system: &System) -> anyhow::Result<()> {
+    let folder = match config.mission.folder.as_str() {
+        "" => system.runtime_dir.clone(),
+        mission => Path::new(mission).join("logs"),
+    };
+    // A process that is held is there itself.
+    let dump_core = config.launch.core_dumps && !config.launch.hold_on_fault;
+    if dump_core {
+        match post_mortem::allow_core_dumps() {
+            Ok(Some(0)) => tracing::warn!("launch.core_dumps: the system allows none (ulimit -Hc is 0)"),
+            Ok(_) => {}
+            Err(error) => tracing::warn!(%error, "launch.core_dumps: the limit cannot be raised"),
+        }
+    }
+    if config.launch.trace
+        && !config.mission.folder.is_empty()
+        && let Err(error) = trace::begin(&Path::new(&config.mission.folder).join("trace"), name.name())
+    {
+        tracing::warn!(%error, "launch.trace: the trace of this process cannot be written");
+    }
+    let about = About { service: name.name(), folder, config: load::to_toml(config)?, dump_core };
+    post_mortem::report_panics(about);
+    if config.launch.hold_on_fault {
+        hold_panics();
+    }
+    Ok(())
 }
 
 /// From now on a panic stops this process where it is, for a debugger; SIGCONT lets it die.

@@ -6,7 +6,8 @@ use shared_types::folder::{FolderError, MissionFolder};
 use shared_types::messages::{ServiceState, mission_key};
 use shared_types::service::{Context, HealthReport, Service, ServiceError, Step, StopAnswer};
 
-use shared_types::{TICK_NS, ns_from_s};
+use shared_types::trace::InState;
+use shared_types::{TICK_NS, ns_from_s, stage};
 
 use crate::desk::{Desk, Settled, WriterGone, asks};
 use crate::io::Inputs;
@@ -37,6 +38,7 @@ pub struct Planner {
     stopping: bool,
     leaving: bool,
     last_error: String,
+    phase: InState,
 }
 
 impl From<WriterGone> for ServiceError {
@@ -88,6 +90,7 @@ impl Planner {
             stopping: false,
             leaving: false,
             last_error: String::new(),
+            phase: InState::default(),
         })
     }
 }
@@ -103,6 +106,8 @@ impl Planner {
         }
         let outputs = self.mission.step(now_ns, inputs, &mut self.views);
         self.decided += 1;
+        let phase = self.mission.phase();
+        self.phase.is(phase.code(), || stage!("phase", name = phase.name(), track = "flight"));
         if outputs.entries.is_empty() {
             return outputs.effects.iter().try_for_each(|effect| Ok(self.ports.carry_out(now_ns, effect)?));
         }

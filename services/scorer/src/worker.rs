@@ -8,6 +8,7 @@ use std::thread::JoinHandle;
 use crate::job::{Held, Job, Scores};
 use crate::renderer::Renderer;
 use rustix::time::{ClockId, clock_gettime};
+use shared_types::stage;
 
 /// A scoring that is done.
 #[derive(Debug, Clone, PartialEq)]
@@ -45,9 +46,11 @@ impl Worker {
         let (cancelled, done) = (Arc::clone(&cancel), Arc::clone(&work));
         let thread = std::thread::Builder::new().name("score".to_owned()).spawn(move || {
             while let Ok((job, held)) = job_receiver.recv() {
+                let stage = stage!("score", candidates = job.candidates(), gaussians = held.model.len());
                 let before = process_cpu_ns();
                 let Some(scores) = renderer.score(&job, &held.model, &cancelled, &done) else { return };
                 let scored = Scored { scores, cpu_ns: process_cpu_ns().saturating_sub(before) };
+                drop(stage);
                 if result_sender.send(scored).is_err() {
                     return;
                 }

@@ -15,6 +15,7 @@ use shared_types::config::world::MeshUp;
 use shared_types::frames::{Intrinsics, Pose};
 use shared_types::messages::{RenderPurpose, RenderReply, RenderRequest, RenderStatus, ServiceState};
 use shared_types::service::{Context, HealthReport, Service, ServiceError, Step};
+use shared_types::stage;
 
 use crate::history::{Lookup, TruthHistory};
 use crate::mesh::UpAxis;
@@ -268,6 +269,7 @@ impl Renderer {
             width: request.width,
             height: request.height,
         };
+        let _stage = stage!("render", width = request.width, color);
         let before_ns = cpu_ns();
         let image = render(scene, world_from_camera, &intrinsics, &options, &self.threads);
         let header = RenderReply {

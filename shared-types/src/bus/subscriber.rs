@@ -11,6 +11,7 @@ use super::error::BusError;
 use super::message::{Framed, Message};
 use crate::channel::Channel;
 use crate::messages::Fault;
+use crate::post_mortem::heard;
 
 type RawSubscriber<C> =
     iceoryx2::port::subscriber::Subscriber<Ipc, [<C as Channel>::Item], Framed<<C as Channel>::Header>>;
@@ -170,6 +171,7 @@ impl<C: Channel> Subscriber<C> {
             let next = self.expected.entry(sender).or_insert(envelope.sequence);
             self.lost = self.lost.saturating_add(envelope.sequence.saturating_sub(*next));
             *next = envelope.sequence.saturating_add(1);
+            heard::note(C::NAME, envelope.sender, envelope.sequence, envelope.sent_ns);
             return Ok(Some(message));
         }
         Ok(None)

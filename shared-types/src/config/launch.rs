@@ -28,6 +28,10 @@ pub struct LaunchConfig {
     pub watchdog_work_s: f64,
     /// A service that died or hangs is left as it is for a debugger, instead of being started again.
     pub hold_on_fault: bool,
+    /// A service that panics dumps its core, where the system allows it (`ulimit -Hc`, /proc/sys/kernel/core_pattern).
+    pub core_dumps: bool,
+    /// Every process writes how long its stages take (trace/), and launch puts them on one time axis (report/trace.json).
+    pub trace: bool,
     /// Time between two measurements of memory (PSS), seconds; 0: none.
     pub memory_period_s: f64,
     /// Log level of the services' log files: error, warn, info, debug or trace.
@@ -49,6 +53,8 @@ impl Default for LaunchConfig {
             watchdog_start_s: 60.0,
             watchdog_work_s: 120.0,
             hold_on_fault: false,
+            core_dumps: false,
+            trace: false,
             memory_period_s: 2.0,
             log_level: "info".to_owned(),
             evaluate_views: 100,

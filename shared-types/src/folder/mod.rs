@@ -217,6 +217,12 @@ impl MissionFolder {
         self.root.join("model")
     }
 
+    /// `trace/`: how long stages of the processes took, where that was asked for.
+    #[must_use]
+    pub fn trace_path(&self) -> PathBuf {
+        self.root.join("trace")
+    }
+
     /// `report`: what was measured.
     #[must_use]
     pub fn report_path(&self) -> PathBuf {

@@ -48,10 +48,19 @@ impl Mission {
         }
     }
 
+    /// The phase that others see.
+    #[must_use]
+    pub fn phase(&self) -> MissionPhase {
+        if self.stepping_down && self.is_over() && self.ledger.over.is_none() {
+            // The mission goes on with the next process.
+            return MissionPhase::Landing;
+        }
+        self.state.phase(self.waiting(), self.ledger.over.is_some_and(|(_, usable)| usable))
+    }
+
     fn mission_state(&self) -> MissionState {
         let ledger = &self.ledger;
         let config = &self.setup.planner;
-        let usable = ledger.over.is_some_and(|(_, usable)| usable);
         let unrecorded = match (self.cancelled, self.misaligned) {
             (true, _) => EndReason::Operator,
             (false, true) => EndReason::Misaligned,
@@ -65,12 +74,7 @@ impl Mission {
             started_ns: ledger.started_ns.unwrap_or(0),
             mission_id: pack_text(&self.setup.mission_id),
             folder: pack_text(&self.setup.folder),
-            phase: if self.stepping_down && self.is_over() && ledger.over.is_none() {
-                // The mission goes on with the next process.
-                MissionPhase::Landing.code()
-            } else {
-                self.state.phase(self.waiting(), usable).code()
-            },
+            phase: self.phase().code(),
             end_reason: reason.code(),
             round: count(ledger.rounds.len()),
             keyframes: count(ledger.taken.len()),
