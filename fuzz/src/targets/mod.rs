@@ -5,6 +5,7 @@ mod mavlink;
 mod meshes;
 mod missions;
 mod models;
+mod recordings;
 
 use crate::Target;
 
@@ -40,4 +41,5 @@ pub const TARGETS: &[Target] = &[
     Target { name: "keyframe", run: missions::keyframe, seeds: missions::keyframe_seeds, mutations: 5000 },
     Target { name: "config", run: missions::config, seeds: missions::config_seeds, mutations: 4000 },
     Target { name: "way-back", run: missions::way_back, seeds: missions::way_back_seeds, mutations: 5000 },
+    Target { name: "recording", run: recordings::recording, seeds: recordings::recording_seeds, mutations: 5000 },
 ];

@@ -7,7 +7,7 @@ use std::fs::File;
 use std::io::Read as _;
 use std::path::{Path, PathBuf};
 
-use mcap::records::Record;
+use mcap::records::{Record, op};
 use mcap::sans_io::{LinearReadEvent, LinearReader, LinearReaderOptions};
 use mcap::{McapError, parse_record};
 use shared_types::config::{Config, Layer, load};
@@ -16,10 +16,14 @@ use crate::topics::{self, RAW_ENCODING, SCHEMA_KEY};
 
 /// Name of the metadata record that says what a recording is of.
 pub(crate) const METADATA: &str = "vantage";
-/// Longest record, bytes: a chunk is at most 64 MB and a message beyond its end.
-const LONGEST_RECORD: usize = 1 << 30;
-/// Bytes read at once where the format does not say how many it wants.
-const READ_BYTES: usize = 1 << 16;
+/// Longest record, bytes: a chunk of 64 MB and a model of four million Gaussians beyond its end.
+const LONGEST_RECORD: usize = 400 << 20;
+/// Longest record of a short file: what a few bytes claim to hold takes no memory out of proportion.
+const LONGEST_RECORD_OF_LITTLE: usize = 64 << 20;
+/// What records are compressed to is at least the hundredth part.
+const MOST_COMPRESSED: u64 = 100;
+/// Most bytes that are read at once.
+const READ_BYTES: usize = 1 << 20;
 
 /// Why a recording cannot be used.
 #[derive(Debug, thiserror::Error)]
@@ -137,7 +141,9 @@ impl Recording {
     pub fn open(path: &Path) -> Result<Self, RecordingError> {
         let io = |source| RecordingError::Io { path: path.to_owned(), source };
         let file = File::open(path).map_err(io)?;
-        let options = LinearReaderOptions::default().with_record_length_limit(LONGEST_RECORD);
+        let length = file.metadata().map_err(io)?.len().saturating_mul(MOST_COMPRESSED);
+        let longest = usize::try_from(length).unwrap_or(usize::MAX).clamp(LONGEST_RECORD_OF_LITTLE, LONGEST_RECORD);
+        let options = LinearReaderOptions::default().with_record_length_limit(longest);
         let mut recording = Self {
             path: path.to_owned(),
             file,
@@ -245,11 +251,18 @@ impl Recording {
             let Some(event) = self.reader.next_event() else { return Ok(Next::End) };
             match event? {
                 LinearReadEvent::ReadRequest(wanted) => {
-                    let wanted = wanted.clamp(1, READ_BYTES.max(wanted.min(LONGEST_RECORD)));
+                    // A piece at a time: how long a record is said to be takes no memory before it is there.
+                    let wanted = wanted.clamp(1, READ_BYTES);
                     let read = self.file.read(self.reader.insert(wanted))?;
                     self.reader.notify_read(read);
                 }
                 LinearReadEvent::Record { data, opcode } => {
+                    if !matches!(opcode, op::METADATA | op::CHANNEL | op::MESSAGE) {
+                        return Ok(Next::Other);
+                    }
+                    if !lengths_fit(opcode, data) {
+                        return Err(McapError::UnexpectedEof);
+                    }
                     return Ok(match parse_record(opcode, data)? {
                         Record::Metadata(metadata) if metadata.name == METADATA => Next::Metadata(metadata.metadata),
                         Record::Channel(channel) => Next::Channel(channel),
@@ -264,4 +277,28 @@ impl Recording {
             }
         }
     }
+}
+
+/// Whether the strings of a record end within it: its parser takes the memory that their lengths claim.
+fn lengths_fit(opcode: u8, data: &[u8]) -> bool {
+    let (ids, strings) = match opcode {
+        op::CHANNEL => (4, 2),
+        op::METADATA => (0, 1),
+        _ => return true,
+    };
+    let map = (0..strings).try_fold(data.get(ids..).unwrap_or_default(), |rest, _| Some(counted(rest)?.1));
+    let Some((mut map, _)) = map.and_then(counted) else { return false };
+    while !map.is_empty() {
+        match counted(map) {
+            Some((_, rest)) => map = rest,
+            None => return false,
+        }
+    }
+    true
+}
+
+/// Bytes behind their number, and the rest.
+fn counted(bytes: &[u8]) -> Option<(&[u8], &[u8])> {
+    let (length, rest) = bytes.split_first_chunk()?;
+    rest.split_at_checked(u32::from_le_bytes(*length).try_into().ok()?)
 }
