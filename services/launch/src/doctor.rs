@@ -10,7 +10,9 @@ use splatting::gpu::{self, AdapterReport};
 
 use crate::cli::Doctor;
 use crate::exit::Exit;
-use crate::machine_check::{DESCRIPTORS, raised_descriptors, shared_memory_need_bytes, space_bytes};
+use crate::machine_check::{
+    DESCRIPTORS, memory_available_bytes, memory_need_bytes, raised_descriptors, shared_memory_need_bytes, space_bytes,
+};
 use crate::{instance, print, settings};
 
 /// How a check came out.
@@ -51,7 +53,7 @@ impl Finding {
 pub fn run(arguments: &Doctor) -> anyhow::Result<Exit> {
     let config = settings::resolve(&arguments.settings)?;
     let base = System::base_dir();
-    let findings: Vec<Finding> = [shared_memory(&config), runtime_folder(&base)]
+    let findings: Vec<Finding> = [memory(&config), shared_memory(&config), runtime_folder(&base)]
         .into_iter()
         .chain(leftovers(&base, arguments.clean))
         .chain([ports(), real_time(), processor(), open_files()])
@@ -77,6 +79,22 @@ fn describe(findings: &[Finding]) -> String {
         }
     }
     text
+}
+
+fn memory(config: &Config) -> Finding {
+    let need = memory_need_bytes(config) >> 20;
+    match memory_available_bytes() {
+        None => Finding::new("memory", Verdict::Advice, "the system does not say how much is available", ""),
+        Some(available) if available >> 20 >= need => {
+            let found = format!("{} MiB available, a mission needs {need} MiB", available >> 20);
+            Finding::new("memory", Verdict::Ok, found, "")
+        }
+        Some(available) => {
+            let found = format!("{} MiB available, a mission needs {need} MiB", available >> 20);
+            let advice = "a smaller model.max_gaussians, or the profile of a small computer (/usr/share/vantage/profiles)";
+            Finding::new("memory", Verdict::Problem, found, advice)
+        }
+    }
 }
 
 fn shared_memory(config: &Config) -> Finding {

@@ -1,4 +1,4 @@
-//! What a mission needs of this machine before it may take off: descriptors, shared memory and disk space.
+//! What a mission needs of this machine before it may take off: descriptors, memory, shared memory and disk space.
 
 use std::path::Path;
 
@@ -47,6 +47,36 @@ pub fn disk_need_bytes(config: &Config) -> u64 {
     views * pixels * 4 + Limits::of(config).gaussians as u64 * GAUSSIAN_BYTES * 3 / 2 + (4 << 20)
 }
 
+/// What the services take without any Gaussians, and for each one of the model, bytes: trainer and scorer together, measured
+/// at 100,000 and 500,000 (`services/splatting/README.md`), with a third to spare.
+const SERVICES_BYTES: u64 = 150 << 20;
+/// See [`SERVICES_BYTES`].
+const BYTES_PER_GAUSSIAN: u64 = 350;
+
+/// Memory that a mission may take at its model's cap, bytes, with what it reserves in shared memory.
+#[must_use]
+pub fn memory_need_bytes(config: &Config) -> u64 {
+    let gaussians = Limits::of(config).gaussians as u64;
+    SERVICES_BYTES + BYTES_PER_GAUSSIAN * gaussians + shared_memory_need_bytes(config)
+}
+
+/// Memory that processes may still take, bytes: of the machine, or of the container where that has a limit. `None` where the
+/// system does not say.
+#[must_use]
+pub fn memory_available_bytes() -> Option<u64> {
+    let machine = available_of(&std::fs::read_to_string("/proc/meminfo").ok()?)?;
+    let number = |name| std::fs::read_to_string(Path::new("/sys/fs/cgroup").join(name)).ok()?.trim().parse().ok();
+    let container: Option<u64> =
+        number("memory.max").map(|most: u64| most.saturating_sub(number("memory.current").unwrap_or(0)));
+    Some(container.map_or(machine, |bytes| bytes.min(machine)))
+}
+
+/// `MemAvailable` of /proc/meminfo.
+fn available_of(meminfo: &str) -> Option<u64> {
+    let line = meminfo.lines().find_map(|line| line.strip_prefix("MemAvailable:"))?;
+    line.trim().strip_suffix("kB")?.trim().parse::<u64>().ok().map(|kb| kb << 10)
+}
+
 /// Size and free space of the file system that holds a path, bytes.
 ///
 /// # Errors
@@ -62,6 +92,7 @@ pub fn space_bytes(path: &Path) -> std::io::Result<(u64, u64)> {
 /// Exit 69, with what is missing and the way out.
 pub fn check_machine(folder: &Path, config: &Config) -> anyhow::Result<()> {
     check_descriptors()?;
+    check_memory(config, memory_available_bytes())?;
     check_shared_memory(config)?;
     check_disk(folder, config)
 }
@@ -93,6 +124,20 @@ fn check_descriptors() -> anyhow::Result<()> {
 
 fn mib(bytes: u64) -> u64 {
     bytes.div_ceil(1 << 20)
+}
+
+fn check_memory(config: &Config, available: Option<u64>) -> anyhow::Result<()> {
+    let need = memory_need_bytes(config);
+    match available {
+        Some(available) if available < need => Err(Refusal::missing(format!(
+            "memory: {} MiB available, expected at least {} MiB; end other programs, lower model.max_gaussians ({}), or begin \
+             with the profile of a small computer (/usr/share/vantage/profiles)",
+            mib(available),
+            mib(need),
+            config.model.max_gaussians
+        ))),
+        Some(_) | None => Ok(()),
+    }
 }
 
 fn check_shared_memory(config: &Config) -> anyhow::Result<()> {
@@ -148,11 +193,23 @@ mod tests {
     }
 
     #[test]
+    fn available_memory_is_read_as_the_kernel_writes_it() {
+        assert_eq!(available_of("MemTotal:       24 kB\nMemAvailable:   12 kB\n"), Some(12 << 10));
+        assert_eq!(available_of("MemTotal:       24 kB\n"), None);
+        assert_eq!(available_of("MemAvailable: much kB\n"), None);
+        assert!(memory_available_bytes().is_some_and(|bytes| bytes > 1 << 20));
+    }
+
+    #[test]
     fn a_machine_that_is_too_small_is_told_the_way_out() {
         let mut config = Config::default();
         config.model.max_gaussians = 4_000_000_000;
         let message = check_shared_memory(&config).expect_err("too small").to_string();
         assert!(message.contains("/dev/shm") && message.contains("model.max_gaussians"), "{message}");
+        let message = check_memory(&config, Some(700 << 20)).expect_err("too small").to_string();
+        assert!(message.contains("memory: 700 MiB available") && message.contains("profiles"), "{message}");
+        check_memory(&Config::default(), Some(700 << 20)).expect("a gigabyte is enough for the default");
+        check_memory(&config, None).expect("nobody says how much there is");
         config.camera.width_px = 1_000_000;
         config.camera.height_px = 1_000_000;
         let folder = Path::new("/tmp/not/yet/there");
