@@ -149,7 +149,7 @@ channels! {
     /// The planner's heartbeat.
     AliveChannel = "planner/alive", Alive, u8, Settings::SMALL;
     /// Half of [`MissionCommandChannel`].
-    MissionCommandRequests = "mission/command/request", MissionRequest, u8, Settings { senders: 2, ..Settings::SMALL };
+    MissionCommandRequests = "mission/command/request", MissionRequest, u8, Settings { senders: 3, ..Settings::SMALL };
     /// Half of [`MissionCommandChannel`].
     MissionCommandReplies = "mission/command/reply", MissionReply, u8, Settings::SMALL;
     /// What the mission does.

@@ -91,7 +91,8 @@ fn memory(config: &Config) -> Finding {
         }
         Some(available) => {
             let found = format!("{} MiB available, a mission needs {need} MiB", available >> 20);
-            let advice = "a smaller model.max_gaussians, or the profile of a small computer (/usr/share/vantage/profiles)";
+            let advice =
+                "a smaller model.max_gaussians, or the profile of a small computer (/usr/share/vantage/profiles)";
             Finding::new("memory", Verdict::Problem, found, advice)
         }
     }

@@ -11,6 +11,7 @@ pub mod asks;
 pub mod commands;
 pub mod frames;
 pub mod gimbal;
+pub mod ground;
 pub mod logic;
 pub mod mavlink_io;
 pub mod params;
@@ -31,6 +32,7 @@ use anyhow::Context as _;
 use shared_types::messages::{ClockTick, ServiceState};
 use shared_types::service::{Context, HealthReport, Service, ServiceError, Step, StopAnswer};
 
+use ground::Ground;
 use logic::Core;
 use mavlink_io::{Link, Sender};
 use ports::Ports;
@@ -48,6 +50,8 @@ struct Px4Link {
     link: Link,
     sender: Sender,
     core: Core,
+    ground: Ground,
+    takes_orders: bool,
     runner: Runner,
     lockstep: bool,
     published_ns: Option<u64>,
@@ -69,8 +73,18 @@ impl Service for Px4Link {
         while let Some(received) = self.link.next_message() {
             self.core.on_message(now_ns, &received);
         }
+        while let Some((received, order)) = self.link.next_order() {
+            let given = if self.takes_orders { self.ground.on_order(now_ns, &received, order) } else { None };
+            if let Some((id, order)) = given {
+                self.ports.order(now_ns, id, order)?;
+            }
+        }
         self.core.on_report(self.runner.report());
         self.ports.receive(now_ns, &mut self.core)?;
+        self.ports.receive_for_ground(now_ns, &mut self.ground)?;
+        for message in self.ground.take_messages(now_ns) {
+            self.sender.send(&message);
+        }
         let outputs = self.core.step(now_ns);
         for message in &outputs.messages {
             self.sender.send(message);
@@ -154,6 +168,8 @@ pub fn run(mut context: Context) -> anyhow::Result<()> {
         ports: Ports::open(&context.bus)?,
         link,
         sender,
+        ground: Ground::new(context.incarnation),
+        takes_orders: config.take_orders,
         core: Core::new(&config, lockstep, context.incarnation, Store::new(&context.system.runtime_dir)),
         runner,
         lockstep,

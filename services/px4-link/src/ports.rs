@@ -1,9 +1,14 @@
 //! All of px4-link's channels.
 
-use shared_types::bus::{Bus, BusError, Publisher, ReplyAddress, Server, Subscriber};
-use shared_types::channel::{AliveChannel, VehicleCommandChannel, VehicleStateChannel, VehicleTargetChannel};
-use shared_types::messages::{CommandReply, VehicleState};
+use shared_types::bus::{Bus, BusError, Client, Publisher, ReplyAddress, Server, Subscriber};
+use shared_types::channel::{
+    AliveChannel, MissionCommandChannel, MissionStateChannel, VehicleCommandChannel, VehicleStateChannel,
+    VehicleTargetChannel,
+};
+use shared_types::messages::{CommandReply, MissionCommand, MissionRequest, VehicleState};
+use shared_types::payload::unpack_text;
 
+use crate::ground::Ground;
 use crate::logic::Core;
 
 /// The channels.
@@ -12,6 +17,8 @@ pub struct Ports {
     targets: Subscriber<VehicleTargetChannel>,
     alive: Subscriber<AliveChannel>,
     commands: Server<VehicleCommandChannel>,
+    mission: Subscriber<MissionStateChannel>,
+    orders: Client<MissionCommandChannel>,
     sent: u64,
     received: u64,
     dropped: u64,
@@ -34,6 +41,8 @@ impl Ports {
             targets: bus.subscriber()?,
             alive: bus.subscriber()?,
             commands: bus.server()?,
+            mission: bus.subscriber()?,
+            orders: bus.client()?,
             sent: 0,
             received: 0,
             dropped: 0,
@@ -59,6 +68,33 @@ impl Ports {
             core.on_target(target.header(), target.items());
         }
         Ok(())
+    }
+
+    /// Gives ground stations what the planner says: of the mission, and to their orders.
+    ///
+    /// # Errors
+    /// When a channel is broken.
+    pub fn receive_for_ground(&mut self, now_ns: u64, ground: &mut Ground) -> Result<(), BusError> {
+        while let Some(reply) = self.orders.receive(now_ns)? {
+            self.received += 1;
+            let header = reply.header();
+            let answer = if header.accepted == 1 { Ok(()) } else { Err(unpack_text(&header.reason)) };
+            ground.on_answer(reply.envelope().request_id, answer);
+        }
+        while let Some(state) = self.mission.receive(now_ns)? {
+            self.received += 1;
+            ground.on_mission(now_ns, state.header());
+        }
+        Ok(())
+    }
+
+    /// Passes an order on to the planner.
+    ///
+    /// # Errors
+    /// When the channel is broken; a missing chunk is counted, and whoever ordered asks again.
+    pub fn order(&mut self, now_ns: u64, id: u64, order: MissionCommand) -> Result<(), BusError> {
+        let result = self.orders.send(now_ns, id, &MissionRequest { command: order.code(), reserved: 0 }, &[]);
+        self.count(result)
     }
 
     /// Drops what has come: it was meant for an earlier life.

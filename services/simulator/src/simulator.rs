@@ -11,6 +11,7 @@ use crate::commands;
 use crate::faults::Faults;
 use crate::gimbal::Controller;
 use crate::mav::codec::{Outbox, RawAck, frames};
+use crate::mav::forwarding::Seen;
 use crate::mav::inbound::{Inbound, read};
 use crate::mav::telemetry::{self, LinkCounters};
 use crate::mav::{ping, status};
@@ -34,6 +35,15 @@ pub enum LinkId {
     Ground,
 }
 
+impl LinkId {
+    fn other(self) -> Self {
+        match self {
+            Self::Onboard => Self::Ground,
+            Self::Ground => Self::Onboard,
+        }
+    }
+}
+
 #[derive(Debug, Clone)]
 struct Link {
     outbox: Outbox,
@@ -44,6 +54,7 @@ struct Link {
     heard: bool,
     params_left: Option<usize>,
     text_id: u16,
+    seen: Seen,
 }
 
 impl Link {
@@ -56,6 +67,7 @@ impl Link {
             heard,
             params_left: None,
             text_id: 0,
+            seen: Seen::default(),
         }
     }
 
@@ -171,6 +183,11 @@ impl Simulator {
             let side = self.side(link);
             side.heard = true;
             side.counters.received = side.counters.received.wrapping_add(1);
+            side.seen.note(&frame);
+            let other = self.side(link.other());
+            if other.seen.wants(&frame, (system_id, COMPONENT)) {
+                other.outbox.pass_on(frame.bytes);
+            }
             if let Some(inbound) = read(&frame, system_id) {
                 self.handle(link, sender, inbound, late_ns);
             }

@@ -27,6 +27,9 @@ pub struct LinkConfig {
     /// Whether px4-link also sends a ground station's heartbeat: gives the autopilot's texts, but hides the loss of a real
     /// ground station from it. Not given: only towards this machine.
     pub gcs_heartbeat: Option<bool>,
+    /// Whether ground stations may start, stop, land, hold and continue the mission, by MAV_CMD_USER_1 to USER_5 for component
+    /// 191.
+    pub take_orders: bool,
     /// Fly although COM_OBL_RC_ACT is 0 to 2 and no remote control is there (the autopilot then climbs and returns when
     /// setpoints stop).
     pub allow_unsafe_offboard_loss: bool,
@@ -61,6 +64,7 @@ impl Default for LinkConfig {
             arm: None,
             set_params: None,
             gcs_heartbeat: None,
+            take_orders: true,
             allow_unsafe_offboard_loss: false,
             speed_mps: 3.0,
             acceleration_mps2: 2.5,

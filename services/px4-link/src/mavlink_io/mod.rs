@@ -16,12 +16,17 @@ use std::time::{Duration, Instant};
 
 use mavlink::dialects::common::{MavAutopilot, MavMessage};
 
+use shared_types::messages::MissionCommand;
+
+use crate::ground;
 pub use codec::{Received, decode, encode, take_frames};
 use line::Line;
 
 /// The component that px4-link is: MAV_COMP_ID_ONBOARD_COMPUTER.
 pub const OWN_COMPONENT: u8 = 191;
 const QUEUE: usize = 1024;
+/// Orders that may wait; who sends more of them sends them again.
+const ORDERS_MAX: usize = 16;
 const MISSING_LIMIT: Duration = Duration::from_millis(200);
 /// After an absence, what a TCP or serial line still holds of it is read and dropped for this long.
 const STALE_FOR: Duration = Duration::from_millis(300);
@@ -117,6 +122,7 @@ pub struct Link {
     sender: Sender,
     reader: Option<Receiver<Received>>,
     waiting: VecDeque<Received>,
+    orders: VecDeque<(Received, MissionCommand)>,
     /// Datagrams of the peer taken, as the clock counts them.
     taken: u64,
     /// Datagrams that the clock counted and that never came.
@@ -167,6 +173,7 @@ impl Link {
             sender: Sender(Arc::new(shared)),
             reader,
             waiting: VecDeque::new(),
+            orders: VecDeque::new(),
             taken: 0,
             missing: 0,
             foreign: 0,
@@ -208,6 +215,7 @@ impl Link {
             self.take_all();
             if core::mem::take(&mut self.discards) {
                 self.waiting.clear();
+                self.orders.clear();
             }
             self.joined = true;
             self.taken = datagrams;
@@ -233,6 +241,7 @@ impl Link {
         self.joined = false;
         self.discards = true;
         self.waiting.clear();
+        self.orders.clear();
         self.stale_until = self.reader.is_some().then(|| Instant::now() + STALE_FOR);
     }
 
@@ -244,6 +253,11 @@ impl Link {
     /// The next message of the pinned autopilot's system.
     pub fn next_message(&mut self) -> Option<Received> {
         self.waiting.pop_front()
+    }
+
+    /// The next order for the mission, which the autopilot has forwarded from a ground station.
+    pub fn next_order(&mut self) -> Option<(Received, MissionCommand)> {
+        self.orders.pop_front()
     }
 
     /// Takes one datagram or message. False when none is there.
@@ -287,6 +301,14 @@ impl Link {
             if self.sender.0.peer.set(peer).is_ok() {
                 tracing::info!(system = peer.system, address = ?peer.address, "found the autopilot");
             }
+        }
+        if let Some(peer) = self.sender.peer().filter(|peer| peer.address.is_none() || peer.address == from)
+            && let Some(order) = ground::ordered(peer.system, &received)
+        {
+            if self.orders.len() < ORDERS_MAX {
+                self.orders.push_back((received, order));
+            }
+            return;
         }
         match self.sender.peer() {
             Some(peer) if peer.system == received.system && (peer.address.is_none() || peer.address == from) => {

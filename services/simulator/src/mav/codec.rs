@@ -22,6 +22,8 @@ pub struct Frame<'a> {
     pub message_id: u32,
     /// Payload, without the zeros that the sender cut off.
     pub payload: &'a [u8],
+    /// All of it, as it came.
+    pub bytes: &'a [u8],
 }
 
 impl Frame<'_> {
@@ -90,7 +92,8 @@ fn v2(bytes: &[u8]) -> Option<(Frame<'_>, usize)> {
         return None;
     }
     let total = end + 2 + if incompatible & SIGNED == 0 { 0 } else { 13 };
-    Some((Frame { system_id, component_id, message_id, payload: bytes.get(10..end)? }, total))
+    let (payload, bytes) = (bytes.get(10..end)?, bytes.get(..total)?);
+    Some((Frame { system_id, component_id, message_id, payload, bytes }, total))
 }
 
 fn v1(bytes: &[u8]) -> Option<(Frame<'_>, usize)> {
@@ -100,7 +103,8 @@ fn v1(bytes: &[u8]) -> Option<(Frame<'_>, usize)> {
     if !checked(bytes.get(1..end)?, bytes.get(end..end + 2)?, message_id) {
         return None;
     }
-    Some((Frame { system_id, component_id, message_id, payload: bytes.get(6..end)? }, end + 2))
+    let (payload, bytes) = (bytes.get(6..end)?, bytes.get(..end + 2)?);
+    Some((Frame { system_id, component_id, message_id, payload, bytes }, end + 2))
 }
 
 /// COMMAND_ACK with the command as a number, so that unknown ones can be answered.
@@ -174,8 +178,17 @@ impl Outbox {
         self.append(raw.raw_bytes());
     }
 
+    /// Adds a frame of somebody else, as it is.
+    pub fn pass_on(&mut self, frame: &[u8]) {
+        self.put(frame);
+    }
+
     fn append(&mut self, frame: &[u8]) {
         self.header.sequence = self.header.sequence.wrapping_add(1);
+        self.put(frame);
+    }
+
+    fn put(&mut self, frame: &[u8]) {
         if self.open.len() + frame.len() > DATAGRAM_MAX {
             self.full.push(core::mem::take(&mut self.open));
         }
