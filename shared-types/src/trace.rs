@@ -206,10 +206,8 @@ mod tests {
             [("inner", json!({"k": 0.5})), ("score", json!({"views": 95, "found": 3})), ("landing", json!({}))];
         assert_eq!(told, expected.iter().map(|(name, fields)| (*name, fields)).collect::<Vec<_>>());
         let [inner, outer, flight] = &lines[..] else { panic!("{lines:?}") };
-        let (begin, end) = |line: &Value| -> (f64, f64) {
-            let begin = line["ts"].as_f64().unwrap();
-            (begin, begin + line["dur"].as_f64().unwrap())
-        }(outer);
+        let begin = outer["ts"].as_f64().unwrap();
+        let end = begin + outer["dur"].as_f64().unwrap();
         let inside = inner["ts"].as_f64().unwrap();
         assert!(begin < inside && inside < end && end - begin >= 20_000.0 && end - begin < 5e6, "{text}");
         assert_eq!((&flight["tid"], &flight["ph"], &flight["cat"]), (&json!("flight"), &json!("X"), &json!("scorer")));

@@ -58,6 +58,9 @@ pub enum Command {
     /// Change the log level of one service of a running system, or of all; nothing is started again.
     #[command(after_help = "Example: vantage log trainer debug")]
     Log(Log),
+    /// Draw where a running service spends its time: a flame graph.
+    #[command(after_help = "Example: vantage profile trainer --seconds 10")]
+    Profile(Profile),
     /// Check this machine and say what to do about what is found.
     #[command(after_help = "Example: vantage doctor --clean")]
     Doctor(Doctor),
@@ -272,6 +275,22 @@ pub struct Log {
     /// What it logs from now on.
     #[arg(value_parser = clap::builder::PossibleValuesParser::new(shared_types::logging::LEVELS))]
     pub level: String,
+    /// Name or folder of the system; default: the only one there is.
+    #[arg(long, value_name = "NAME")]
+    pub system: Option<String>,
+}
+
+/// Arguments of `profile`.
+#[derive(Debug, Clone, Args)]
+pub struct Profile {
+    /// The service.
+    pub service: String,
+    /// How long it is looked at.
+    #[arg(long, default_value_t = 10, value_name = "S", value_parser = clap::value_parser!(u32).range(1..=3600))]
+    pub seconds: u32,
+    /// Where the picture goes; default: SERVICE.svg here.
+    #[arg(long, value_name = "FILE")]
+    pub output: Option<PathBuf>,
     /// Name or folder of the system; default: the only one there is.
     #[arg(long, value_name = "NAME")]
     pub system: Option<String>,

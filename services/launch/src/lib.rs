@@ -24,6 +24,7 @@ pub mod machine_check;
 pub mod order;
 pub mod prepare;
 pub mod proc;
+pub mod profile;
 pub mod progress;
 pub mod reach;
 pub mod reconstruct;
@@ -100,6 +101,7 @@ fn run(command: &Command) -> anyhow::Result<Exit> {
         Command::GoOn(arguments) => order::run(MissionCommand::GoOn, arguments),
         Command::Tap(arguments) => tap::run(arguments),
         Command::Log(arguments) => control::log(arguments),
+        Command::Profile(arguments) => profile::run(arguments),
         Command::Doctor(arguments) => doctor::run(arguments),
         Command::Evaluate(arguments) => evaluate::run(arguments),
         Command::Export(arguments) => export_any(arguments),

@@ -32,6 +32,7 @@ pub fn run(arguments: &Prepare) -> anyhow::Result<Exit> {
         config.simulator.instance = instance;
         config.link.url = format!("udpin:127.0.0.1:{}", 14540 + instance);
     }
+    forget_exits(&System::base_dir());
     let text = shared_types::config::load::to_toml(&config)?;
     let system = System::create(&System::base_dir(), &arguments.system, 0)?;
     write_atomic(&system.config_path(), text.as_bytes())?;
@@ -41,6 +42,16 @@ pub fn run(arguments: &Prepare) -> anyhow::Result<Exit> {
         folder.root().display(),
         system.runtime_dir.display()
     ))
+}
+
+/// Removes what units keep of how services of an earlier mission ended (`ExecStopPost=`).
+fn forget_exits(base: &Path) {
+    let files = std::fs::read_dir(base).into_iter().flatten().flatten().map(|entry| entry.path());
+    for path in files.filter(|path| path.extension().is_some_and(|extension| extension == "exit")) {
+        if let Err(error) = std::fs::remove_file(&path) {
+            tracing::warn!(path = %path.display(), %error, "cannot be removed; a service may take its last life for a crash");
+        }
+    }
 }
 
 /// The folder that holds missions.

@@ -147,6 +147,15 @@ fn look_at_in_time(system: System) -> anyhow::Result<SystemReport> {
 }
 
 /// What is known of a system without joining it.
+/// Names and process ids of the services of a system that run.
+///
+/// # Errors
+/// When its bus cannot be joined.
+pub fn pids(system: System) -> anyhow::Result<Vec<(String, u32)>> {
+    let report = look_at_in_time(system)?;
+    Ok(report.services.into_iter().filter(|row| row.alive).map(|row| (row.service, row.pid)).collect())
+}
+
 fn blank(system: &System, condition: &'static str) -> SystemReport {
     SystemReport {
         system: system.name.clone(),
