@@ -108,7 +108,7 @@ fn a_ground_station_starts_a_mission_and_ends_it() {
     let base = tempfile::tempdir().expect("folder");
     let folder = base.path().join("mission");
     let instance = format!("simulator.instance={INSTANCE}");
-    let sets = ["--set", &instance, "--set", "planner.autostart=false", "--speed", "6"];
+    let sets = ["--set", &instance, "--set", "planner.autostart=false", "--speed", "6", "--trace"];
     let arguments = [&["--preset", "tiny", "--seed", "21"][..], &sets].concat();
     let mut flight = Flight::start(&folder, &arguments);
     let mut station = Station::new();
@@ -124,4 +124,16 @@ fn a_ground_station_starts_a_mission_and_ends_it() {
     station.wait_for("vantage: returning");
     station.wait_for("vantage: done (operator)");
     flight.finish_well();
+    // On the way, every process has told what it did when.
+    let picture = std::fs::read_to_string(folder.join("report/timeline.svg")).expect("a picture");
+    let trace = std::fs::read(folder.join("report/trace.json")).expect("a trace");
+    let trace: serde_json::Value = serde_json::from_slice(&trace).expect("JSON");
+    let events = trace["traceEvents"].as_array().expect("events");
+    for (service, stage) in
+        [("planner", "takeoff"), ("camera", "image of a keyframe"), ("world", "render"), ("launch", "fly")]
+    {
+        assert!(picture.contains(&format!(">{service}")) && picture.contains(stage), "{service}: {stage}");
+        let told = |event: &serde_json::Value| event["cat"] == service && event["name"] == stage;
+        assert!(events.iter().any(told), "{service}: {stage}");
+    }
 }
