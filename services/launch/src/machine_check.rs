@@ -66,9 +66,20 @@ pub fn memory_need_bytes(config: &Config) -> u64 {
 pub fn memory_available_bytes() -> Option<u64> {
     let machine = available_of(&std::fs::read_to_string("/proc/meminfo").ok()?)?;
     let number = |name| std::fs::read_to_string(Path::new("/sys/fs/cgroup").join(name)).ok()?.trim().parse().ok();
-    let container: Option<u64> =
-        number("memory.max").map(|most: u64| most.saturating_sub(number("memory.current").unwrap_or(0)));
+    // Files that the kernel keeps in memory give way.
+    let kept = std::fs::read_to_string("/sys/fs/cgroup/memory.stat").map_or(0, |stat| file_cache_of(&stat));
+    let used = number("memory.current").unwrap_or(0_u64).saturating_sub(kept);
+    let container: Option<u64> = number("memory.max").map(|most: u64| most.saturating_sub(used));
     Some(container.map_or(machine, |bytes| bytes.min(machine)))
+}
+
+/// Bytes of files in memory, of a control group's memory.stat.
+fn file_cache_of(stat: &str) -> u64 {
+    let pages = stat.lines().filter_map(|line| line.split_once(' '));
+    pages
+        .filter(|(name, _)| ["active_file", "inactive_file"].contains(name))
+        .filter_map(|(_, n)| n.parse::<u64>().ok())
+        .sum()
 }
 
 /// `MemAvailable` of /proc/meminfo.
@@ -197,6 +208,7 @@ mod tests {
         assert_eq!(available_of("MemTotal:       24 kB\nMemAvailable:   12 kB\n"), Some(12 << 10));
         assert_eq!(available_of("MemTotal:       24 kB\n"), None);
         assert_eq!(available_of("MemAvailable: much kB\n"), None);
+        assert_eq!(file_cache_of("anon 9\nfile 700\ninactive_file 300\nactive_file 40\n"), 340);
         assert!(memory_available_bytes().is_some_and(|bytes| bytes > 1 << 20));
     }
 

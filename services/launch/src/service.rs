@@ -65,9 +65,11 @@ pub fn run(name: ServiceName, arguments: &Service) -> anyhow::Result<()> {
 
 /// Sees to what a panic leaves: a report beside the logs, and on request the process itself or its core.
 fn leave_traces(name: ServiceName, config: &Config, system: &System) -> anyhow::Result<()> {
-    let folder = match config.mission.folder.as_str() {
-        "" => system.runtime_dir.clone(),
-        mission => Path::new(mission).join("logs"),
+    // Units see the missions of others, and may write into few.
+    let mission = Path::new(&config.mission.folder);
+    let folder = match rustix::fs::access(mission, rustix::fs::Access::WRITE_OK) {
+        Ok(()) => mission.join("logs"),
+        Err(_) => system.runtime_dir.clone(),
     };
     // A process that is held is there itself.
     let dump_core = config.launch.core_dumps && !config.launch.hold_on_fault;

@@ -22,7 +22,7 @@ pub const ORDERS: [(MavCmd, MissionCommand); 5] = [
 /// Bytes of text in a STATUSTEXT, and the most of them that a sentence takes.
 const TEXT_BYTES: usize = 50;
 const MOST_TEXTS: usize = 4;
-/// An order without an answer for so long is given up: the ground station sends it again, or its user does.
+/// An order without an answer for so long is given up, and its user told; an answer is given again as long.
 const PATIENCE_NS: u64 = 10_000_000_000;
 /// A mission that waits for a human tells so again: whoever is to hear it may have come later.
 const REMINDER_NS: u64 = 10_000_000_000;
@@ -41,6 +41,22 @@ pub fn ordered(system: u8, received: &Received) -> Option<MissionCommand> {
     ORDERS.iter().find(|(known, _)| *known == command).map(|&(_, order)| order)
 }
 
+/// What the planner is asked.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Passed {
+    /// Id of the request.
+    pub id: u64,
+    /// The order.
+    pub order: MissionCommand,
+    /// The request whose place it takes, which nobody waits for any more.
+    pub given_up: Option<u64>,
+}
+
+/// Whether a command says of itself that it was sent before.
+fn is_repeat(received: &Received) -> bool {
+    matches!(&received.message, MavMessage::COMMAND_LONG(m) if m.confirmation > 0)
+}
+
 /// An order of a ground station.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct Asked {
@@ -54,6 +70,7 @@ struct Asked {
 #[derive(Debug)]
 pub struct Ground {
     asked: Option<Asked>,
+    answered: Option<(Asked, MavResult)>,
     /// Ids grow over all lives of this process: it begins with the time of its start.
     next_id: u64,
     /// Phase and round that were told last.
@@ -68,40 +85,63 @@ impl Ground {
     /// Nothing is ordered yet.
     #[must_use]
     pub fn new(incarnation: u64) -> Self {
-        Self { asked: None, next_id: incarnation, told: None, waits: None, texts: 0, out: Vec::new() }
+        Self { asked: None, answered: None, next_id: incarnation, told: None, waits: None, texts: 0, out: Vec::new() }
     }
 
-    /// Takes an order. Returns what the planner is to be asked, with the request's id; nothing for one that is repeated while
-    /// the planner has it.
-    pub fn on_order(
-        &mut self,
-        now_ns: u64,
-        received: &Received,
-        order: MissionCommand,
-    ) -> Option<(u64, MissionCommand)> {
+    /// Takes an order, which takes the place of one that the planner has not answered yet. Returns what the planner is to be
+    /// asked; nothing for one that is repeated.
+    pub fn on_order(&mut self, now_ns: u64, received: &Received, order: MissionCommand) -> Option<Passed> {
         let from = (received.system, received.component);
-        if let Some(asked) = self.asked.filter(|asked| now_ns < asked.at_ns.saturating_add(PATIENCE_NS)) {
-            if (asked.from, asked.order) != (from, order) {
-                self.acknowledge(from, order, MavResult::MAV_RESULT_TEMPORARILY_REJECTED);
-            }
+        if self.asked.is_some_and(|asked| (asked.from, asked.order) == (from, order)) {
             return None;
         }
+        let answered = self.answered.filter(|(asked, _)| {
+            (asked.from, asked.order) == (from, order)
+                && is_repeat(received)
+                && now_ns < asked.at_ns.saturating_add(PATIENCE_NS)
+        });
+        if let Some((_, result)) = answered {
+            // The answer was lost on its way.
+            self.acknowledge(from, order, result);
+            return None;
+        }
+        let given_up = self.give_up(MavResult::MAV_RESULT_TEMPORARILY_REJECTED);
         self.next_id += 1;
         self.asked = Some(Asked { from, order, id: self.next_id, at_ns: now_ns });
         tracing::info!(system = from.0, component = from.1, %order, "ordered by MAVLink");
-        Some((self.next_id, order))
+        Some(Passed { id: self.next_id, order, given_up })
+    }
+
+    /// The request that the planner has not answered for too long: it must not be carried out any more.
+    pub fn overdue(&mut self, now_ns: u64) -> Option<u64> {
+        self.asked.filter(|asked| now_ns >= asked.at_ns.saturating_add(PATIENCE_NS))?;
+        self.give_up(MavResult::MAV_RESULT_FAILED)
+    }
+
+    fn give_up(&mut self, result: MavResult) -> Option<u64> {
+        let Asked { from, order, id, .. } = self.asked.take()?;
+        self.acknowledge(from, order, result);
+        Some(id)
+    }
+
+    /// Tells that nobody takes orders here.
+    pub fn refuse(&mut self, received: &Received, order: MissionCommand) {
+        self.acknowledge((received.system, received.component), order, MavResult::MAV_RESULT_DENIED);
     }
 
     /// The planner's answer to the request with this id.
     pub fn on_answer(&mut self, id: u64, answer: Result<(), String>) {
-        let Some(Asked { from, order, .. }) = self.asked.take_if(|asked| asked.id == id) else { return };
-        match answer {
-            Ok(()) => self.acknowledge(from, order, MavResult::MAV_RESULT_ACCEPTED),
+        let Some(asked) = self.asked.take_if(|asked| asked.id == id) else { return };
+        let Asked { from, order, .. } = asked;
+        let result = match answer {
+            Ok(()) => MavResult::MAV_RESULT_ACCEPTED,
             Err(reason) => {
-                self.acknowledge(from, order, MavResult::MAV_RESULT_DENIED);
                 self.tell(MavSeverity::MAV_SEVERITY_WARNING, &format!("vantage: {order} refused: {reason}"));
+                MavResult::MAV_RESULT_DENIED
             }
-        }
+        };
+        self.acknowledge(from, order, result);
+        self.answered = Some((asked, result));
     }
 
     /// Tells what the mission does, where that is something new.

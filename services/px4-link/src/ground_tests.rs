@@ -62,19 +62,23 @@ fn only_user_commands_to_the_onboard_computer_of_this_system_are_orders() {
 fn an_order_is_answered_to_whom_gave_it_and_repeats_are_not_given_again() {
     let mut ground = Ground::new(1000);
     let start = command((255, 190), MavCmd::MAV_CMD_USER_1, (1, OWN_COMPONENT));
-    let (id, order) = ground.on_order(0, &start, MissionCommand::Start).unwrap();
-    assert_eq!(order, MissionCommand::Start);
+    let Passed { id, order, given_up } = ground.on_order(0, &start, MissionCommand::Start).unwrap();
+    assert_eq!((order, given_up), (MissionCommand::Start, None));
     assert!(id > 1000 && ground.on_order(5, &start, MissionCommand::Start).is_none(), "sent again");
-    let other = command((254, 190), MavCmd::MAV_CMD_USER_3, (1, OWN_COMPONENT));
-    assert!(ground.on_order(6, &other, MissionCommand::Land).is_none());
-    let busy = (MavCmd::MAV_CMD_USER_3, MavResult::MAV_RESULT_TEMPORARILY_REJECTED, 254, 190);
-    assert_eq!(results(&mut ground), [busy]);
     ground.on_answer(id + 1, Ok(()));
     assert!(results(&mut ground).is_empty(), "of another request");
     ground.on_answer(id, Ok(()));
     ground.on_answer(id, Ok(()));
-    assert_eq!(results(&mut ground), [(MavCmd::MAV_CMD_USER_1, MavResult::MAV_RESULT_ACCEPTED, 255, 190)]);
-    let (id, _) = ground.on_order(7, &start, MissionCommand::Start).unwrap();
+    let accepted = (MavCmd::MAV_CMD_USER_1, MavResult::MAV_RESULT_ACCEPTED, 255, 190);
+    assert_eq!(results(&mut ground), [accepted]);
+    // Its answer was lost: given again, and the planner not asked again.
+    let mut repeat = start.clone();
+    if let MavMessage::COMMAND_LONG(m) = &mut repeat.message {
+        m.confirmation = 1;
+    }
+    assert!(ground.on_order(6, &repeat, MissionCommand::Start).is_none());
+    assert_eq!(results(&mut ground), [accepted]);
+    let id = ground.on_order(7, &start, MissionCommand::Start).unwrap().id;
     ground.on_answer(id, Err("the mission has begun already, and what it says is longer than a text".to_owned()));
     let messages = ground.out.clone();
     assert_eq!(results(&mut ground), [(MavCmd::MAV_CMD_USER_1, MavResult::MAV_RESULT_DENIED, 255, 190)]);
@@ -82,10 +86,25 @@ fn an_order_is_answered_to_whom_gave_it_and_repeats_are_not_given_again() {
     let said = texts(&mut ground);
     assert_eq!(said.len(), 1);
     assert!(said[0].starts_with("vantage: start refused: the mission has begun already, and"), "{said:?}");
-    // A planner that never answers does not keep the next order out.
-    let (lost, _) = ground.on_order(8, &start, MissionCommand::Start).unwrap();
-    let (next, _) = ground.on_order(8 + PATIENCE_NS, &start, MissionCommand::Start).unwrap();
-    assert!(next > lost);
+}
+
+/// Nothing is carried out that nobody waits for any more, and no order keeps another out.
+#[test]
+fn an_order_without_an_answer_is_given_up_for_the_next_or_after_a_while() {
+    let mut ground = Ground::new(0);
+    let start = command((255, 190), MavCmd::MAV_CMD_USER_1, (1, OWN_COMPONENT));
+    let land = command((254, 190), MavCmd::MAV_CMD_USER_3, (1, OWN_COMPONENT));
+    let lost = ground.on_order(0, &start, MissionCommand::Start).unwrap().id;
+    let passed = ground.on_order(1, &land, MissionCommand::Land).unwrap();
+    assert_eq!((passed.order, passed.given_up), (MissionCommand::Land, Some(lost)));
+    assert_eq!(results(&mut ground), [(MavCmd::MAV_CMD_USER_1, MavResult::MAV_RESULT_TEMPORARILY_REJECTED, 255, 190)]);
+    assert_eq!(ground.overdue(PATIENCE_NS), None);
+    assert_eq!(ground.overdue(PATIENCE_NS + 1), Some(passed.id));
+    assert_eq!(ground.overdue(PATIENCE_NS + 2), None);
+    assert_eq!(results(&mut ground), [(MavCmd::MAV_CMD_USER_3, MavResult::MAV_RESULT_FAILED, 254, 190)]);
+    ground.on_answer(passed.id, Ok(()));
+    ground.refuse(&start, MissionCommand::Start);
+    assert_eq!(results(&mut ground), [(MavCmd::MAV_CMD_USER_1, MavResult::MAV_RESULT_DENIED, 255, 190)]);
 }
 
 fn state(phase: MissionPhase, round: u32, keyframes: u32) -> MissionState {

@@ -74,9 +74,10 @@ impl Service for Px4Link {
             self.core.on_message(now_ns, &received);
         }
         while let Some((received, order)) = self.link.next_order() {
-            let given = if self.takes_orders { self.ground.on_order(now_ns, &received, order) } else { None };
-            if let Some((id, order)) = given {
-                self.ports.order(now_ns, id, order)?;
+            if !self.takes_orders {
+                self.ground.refuse(&received, order);
+            } else if let Some(passed) = self.ground.on_order(now_ns, &received, order) {
+                self.ports.order(now_ns, passed)?;
             }
         }
         self.core.on_report(self.runner.report());

@@ -5,10 +5,10 @@ use shared_types::channel::{
     AliveChannel, MissionCommandChannel, MissionStateChannel, VehicleCommandChannel, VehicleStateChannel,
     VehicleTargetChannel,
 };
-use shared_types::messages::{CommandReply, MissionCommand, MissionRequest, VehicleState};
+use shared_types::messages::{CommandReply, MissionRequest, VehicleState};
 use shared_types::payload::unpack_text;
 
-use crate::ground::Ground;
+use crate::ground::{Ground, Passed};
 use crate::logic::Core;
 
 /// The channels.
@@ -79,7 +79,13 @@ impl Ports {
             self.received += 1;
             let header = reply.header();
             let answer = if header.accepted == 1 { Ok(()) } else { Err(unpack_text(&header.reason)) };
-            ground.on_answer(reply.envelope().request_id, answer);
+            let id = reply.envelope().request_id;
+            // Else it would be asked again, and a planner that was started anew would carry it out once more.
+            self.orders.finish(id);
+            ground.on_answer(id, answer);
+        }
+        if let Some(id) = ground.overdue(now_ns) {
+            self.orders.finish(id);
         }
         while let Some(state) = self.mission.receive(now_ns)? {
             self.received += 1;
@@ -91,9 +97,13 @@ impl Ports {
     /// Passes an order on to the planner.
     ///
     /// # Errors
-    /// When the channel is broken; a missing chunk is counted, and whoever ordered asks again.
-    pub fn order(&mut self, now_ns: u64, id: u64, order: MissionCommand) -> Result<(), BusError> {
-        let result = self.orders.send(now_ns, id, &MissionRequest { command: order.code(), reserved: 0 }, &[]);
+    /// When the channel is broken; a missing chunk is counted, and it is asked again.
+    pub fn order(&mut self, now_ns: u64, passed: Passed) -> Result<(), BusError> {
+        if let Some(id) = passed.given_up {
+            self.orders.finish(id);
+        }
+        let request = MissionRequest { command: passed.order.code(), reserved: 0 };
+        let result = self.orders.send(now_ns, passed.id, &request, &[]);
         self.count(result)
     }
 

@@ -130,7 +130,8 @@ impl Trainer {
         model.max_gaussians = memory::most_gaussians(
             &model_folder,
             model.max_gaussians,
-            last_exit.as_deref(),
+            // With core dumps a panic ends in SIGABRT, which else is the end of an allocation that was refused.
+            last_exit.as_deref().filter(|exit| !(config.launch.core_dumps && *exit == "signal 6")),
             memory::kernel_kills(),
             || checkpoint::newest(&model_folder, false).map(|newest| newest.gaussians()),
         );
