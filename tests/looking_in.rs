@@ -64,11 +64,6 @@ fn a_mission_is_looked_into_and_does_not_notice() {
     let (text, _) = said(&run(&["tap", "planner/alive", "--system", &name, "--count", "1"]));
     assert!(text.contains("planner/alive planner"), "{text}");
 
-    let refused = run(&["profile", "nobody", "--system", &name]);
-    assert!(refused.status.code() == Some(69) && said(&refused).1.contains("expected one of: keeper"), "{refused:?}");
-    let without = vantage().args(["profile", "planner", "--system", &name]).env("PATH", "").output().expect("runs");
-    assert!(without.status.code() == Some(69) && said(&without).1.contains("linux-perf"), "{without:?}");
-
     let (text, errors) = said(&run(&["log", "planner", "debug", "--system", &name]));
     assert!(text.contains("planner at debug"), "{text}{errors}");
     let (text, _) = said(&run(&["log", "all", "info", "--system", &name]));
@@ -113,6 +108,12 @@ fn status_works_when_half_of_the_services_are_dead() {
         let gone = dead.iter().any(|service| row["service"] == *service);
         assert_eq!(row["alive"], !gone, "{row}");
     }
+
+    // Nor is anybody drawn who does not run, or without what draws.
+    let refused = run(&["profile", "scorer", "--system", &name]);
+    assert!(refused.status.code() == Some(69) && said(&refused).1.contains("expected one of: keeper"), "{refused:?}");
+    let without = vantage().args(["profile", "planner", "--system", &name]).env("PATH", "").output().expect("runs");
+    assert!(without.status.code() == Some(69) && said(&without).1.contains("linux-perf"), "{without:?}");
 }
 
 #[test]
