@@ -13,8 +13,9 @@ use shared_types::storage;
 use splatting::{Gaussians, Optimiser};
 
 use crate::logic::rounds::LossHistory;
+use crate::progression::{ActiveRound, Progression, State};
 use crate::round::{FinishedRound, RoundSpec};
-use crate::session::{ActiveRound, Progression, Session, State};
+use crate::session::Session;
 use splatting::bytes::{Reader, Truncated, Writer, checksum};
 use splatting::order::ViewOrder;
 use splatting::rgbd::voxels::VoxelGrid;

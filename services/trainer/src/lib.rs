@@ -12,6 +12,7 @@ pub mod logic;
 pub mod measure;
 pub mod memory;
 pub mod ports;
+mod progression;
 pub mod requests;
 pub mod round;
 pub mod session;

@@ -19,8 +19,9 @@ use splatting::BackendError;
 use crate::backend;
 use crate::checkpoint;
 use crate::keyframes::KeyframeSource;
+use crate::progression::State;
 use crate::round::{FinishedRound, Progress, RoundSpec};
-use crate::session::{Session, SessionError, Snapshot, State};
+use crate::session::{Session, SessionError, Snapshot};
 
 /// Results that may wait to be published: bounds how far the thread runs ahead of the mission clock, and its memory.
 const AHEAD: usize = 8;

@@ -6,6 +6,7 @@ pub(crate) mod lines;
 
 use std::backtrace::Backtrace;
 use std::fmt::Write as _;
+use std::io::Write as _;
 use std::panic::PanicHookInfo;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
@@ -31,7 +32,10 @@ pub fn report_panics(about: About) {
         tell(panic);
         let path = path(&about.folder, about.service);
         let text = report(&about, panic, since.elapsed().as_secs_f64(), &Backtrace::force_capture());
-        let written = std::fs::create_dir_all(&about.folder).and_then(|()| std::fs::write(&path, text));
+        // Added: where a second thread panics because of the first, the first says why.
+        let written = std::fs::create_dir_all(&about.folder)
+            .and_then(|()| std::fs::File::options().create(true).append(true).open(&path))
+            .and_then(|mut file| file.write_all(text.as_bytes()));
         match written {
             Ok(()) => tracing::error!(path = %path.display(), "a panic; its report is written"),
             Err(error) => tracing::error!(path = %path.display(), %error, "a panic whose report cannot be written"),

@@ -60,9 +60,12 @@ fn read(folder: &MissionFolder) -> Vec<Stage> {
 const ORDER: [&str; 9] =
     ["planner", "px4-link", "camera", "trainer", "scorer", "world", "recorder", "simulator", "launch"];
 
+fn place(service: &str) -> usize {
+    ORDER.iter().position(|name| *name == service).unwrap_or(ORDER.len())
+}
+
 /// Lines of the picture by service and name.
 pub(crate) fn tracks(stages: &[Stage]) -> Vec<(&str, &str)> {
-    let place = |service: &str| ORDER.iter().position(|name| *name == service).unwrap_or(ORDER.len());
     let mut tracks: Vec<(usize, &str, &str)> =
         stages.iter().map(|stage| (place(&stage.cat), stage.cat.as_str(), stage.tid.as_str())).collect();
     tracks.sort_unstable();
@@ -76,7 +79,6 @@ fn to_trace(stages: &[Stage]) -> Value {
     let mut threads: BTreeMap<(u32, &str), usize> = BTreeMap::new();
     let mut open: BTreeMap<(u32, &str), Vec<Vec<f64>>> = BTreeMap::new();
     let mut events = Vec::new();
-    let place = |service: &str| ORDER.iter().position(|name| *name == service).unwrap_or(ORDER.len());
     let mut named = std::collections::BTreeSet::new();
     for stage in stages {
         let key = (stage.pid, stage.tid.as_str());

@@ -114,7 +114,7 @@ impl Training {
     pub fn restore_observed(&mut self, gaussians: Gaussians, optimiser: Optimiser, statistics: ScreenStatistics) {
         (self.gaussians, self.optimiser, self.statistics) = (gaussians, optimiser, statistics);
         self.newest = Newest::Host;
-        self.forget_copy();
+        self.forget_copies();
         self.finished.clear();
     }
 
@@ -138,7 +138,7 @@ impl Training {
     pub fn lists_mut(&mut self) -> Result<(&mut Gaussians, &mut Optimiser, &mut ScreenStatistics), BackendError> {
         self.sync()?;
         self.newest = Newest::Host;
-        self.forget_copy();
+        self.forget_copies();
         self.optimiser.fit(&self.gaussians);
         self.statistics.fit(&self.gaussians);
         Ok((&mut self.gaussians, &mut self.optimiser, &mut self.statistics))
@@ -192,7 +192,7 @@ impl Training {
             return Ok(());
         }
         if edit.sources.is_some() {
-            self.forget_copy();
+            self.forget_copies();
         }
         if self.newest != Newest::Gpu {
             if let Some(sources) = &edit.sources {
@@ -280,7 +280,8 @@ impl Training {
         Ok(arrival)
     }
 
-    fn forget_copy(&mut self) {
+    /// Gives up copies that were begun, and the room that they take.
+    pub fn forget_copies(&mut self) {
         self.copy = Copy::None;
         self.state_copied = false;
         if let Backend::Gpu(engine) = &mut self.backend {

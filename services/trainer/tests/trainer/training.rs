@@ -130,15 +130,21 @@ fn the_untrained_model_is_all_keyframes_of_the_last_round_inserted_at_once() {
     assert!(positions(&found) != positions(trained.model()), "training moves them");
 }
 
+/// Name of a GPU's adapter; where there is none, the test says that it was skipped.
+fn gpu(test: &str) -> Option<String> {
+    let adapter = splatting::gpu::adapters().into_iter().next();
+    if adapter.is_none() {
+        assert!(std::env::var_os("VANTAGE_EXPECT_GPU").is_none(), "no GPU adapter, but one was expected");
+        println!("{test}: skipped, no GPU adapter");
+    }
+    adapter.map(|adapter| adapter.name)
+}
+
 /// A round that was begun on one back end goes on on the other, and back.
 #[test]
 fn a_round_changes_its_back_end_by_a_checkpoint() {
-    let Some(adapter) = splatting::gpu::adapters().into_iter().next() else {
-        assert!(std::env::var_os("VANTAGE_EXPECT_GPU").is_none(), "no GPU adapter, but one was expected");
-        println!("a_round_changes_its_back_end_by_a_checkpoint: skipped, no GPU adapter");
-        return;
-    };
-    let options = |kind| BackendOptions { kind, adapter: Some(adapter.name.clone()), threads: 1, deterministic: false };
+    let Some(adapter) = gpu("a_round_changes_its_back_end_by_a_checkpoint") else { return };
+    let options = |kind| BackendOptions { kind, adapter: Some(adapter.clone()), threads: 1, deterministic: false };
     let gpu = || Backend::new(&options(BackendKind::Gpu)).unwrap().0;
     let cpu = || Backend::new(&options(BackendKind::Cpu)).unwrap().0;
     let mut source = Memory::new((48, 36));
@@ -167,13 +173,8 @@ fn a_round_changes_its_back_end_by_a_checkpoint() {
 /// What pruning and insertion leave on a GPU is, to the bit, what a checkpoint of it brings there.
 #[test]
 fn a_second_round_on_a_gpu_is_the_one_of_a_checkpoint() {
-    let test = "a_second_round_on_a_gpu_is_the_one_of_a_checkpoint";
-    let Some(adapter) = splatting::gpu::adapters().into_iter().next() else {
-        assert!(std::env::var_os("VANTAGE_EXPECT_GPU").is_none(), "no GPU adapter, but one was expected");
-        println!("{test}: skipped, no GPU adapter");
-        return;
-    };
-    let (kind, adapter) = (BackendKind::Gpu, Some(adapter.name));
+    let Some(adapter) = gpu("a_second_round_on_a_gpu_is_the_one_of_a_checkpoint") else { return };
+    let (kind, adapter) = (BackendKind::Gpu, Some(adapter));
     let options = BackendOptions { kind, adapter, threads: 1, deterministic: true };
     let mut source = Memory::new((48, 36));
     let model = shared_types::config::ModelConfig { width: 48, height: 36, ..model_config() };
@@ -201,14 +202,8 @@ fn a_second_round_on_a_gpu_is_the_one_of_a_checkpoint() {
 /// A checkpoint within a round is that of the moment it was begun, though training went on before it arrived.
 #[test]
 fn a_checkpoint_that_a_gpu_brings_later_is_of_the_moment_it_was_begun() {
-    let test = "a_checkpoint_that_a_gpu_brings_later_is_of_the_moment_it_was_begun";
-    let Some(adapter) = splatting::gpu::adapters().into_iter().next() else {
-        assert!(std::env::var_os("VANTAGE_EXPECT_GPU").is_none(), "no GPU adapter, but one was expected");
-        println!("{test}: skipped, no GPU adapter");
-        return;
-    };
-    let options =
-        BackendOptions { kind: BackendKind::Gpu, adapter: Some(adapter.name), threads: 1, deterministic: true };
+    let Some(adapter) = gpu("a_checkpoint_that_a_gpu_brings_later_is_of_the_moment_it_was_begun") else { return };
+    let options = BackendOptions { kind: BackendKind::Gpu, adapter: Some(adapter), threads: 1, deterministic: true };
     let model = shared_types::config::ModelConfig { width: 48, height: 36, ..model_config() };
     let mut source = Memory::new((48, 36));
     let begun = |source: &mut Memory| {
